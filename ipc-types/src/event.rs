@@ -1,0 +1,98 @@
+//! What happened: the JSON of `stack/events` and of the recording's event channel.
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+/// How grave an event is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Level {
+    Info,
+    Warning,
+    Fault,
+}
+
+/// The kinds of events; the names are what a user greps for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EventKind {
+    /// A process was started.
+    Started,
+    /// A service reported that it works.
+    Ready,
+    /// A process ended; `detail` has signal or exit code and its last log lines.
+    Died,
+    /// A service did not beat in time and is killed.
+    Hung,
+    /// A service will be started again.
+    Restarting,
+    /// The restart budget is used up; the service is held.
+    Held,
+    /// The stack ends because of a service.
+    StackFailed,
+    /// The stack is being stopped.
+    Stopping,
+    /// An output owner went to its safe state.
+    SafeEntered,
+    /// ... and left it.
+    SafeLeft,
+    /// A program was loaded.
+    Loaded,
+    /// The PLC started, cold, warm or hot.
+    PlcStarted,
+    /// The PLC was stopped by command.
+    PlcStopped,
+    /// The program faulted.
+    ProgramFault,
+    /// Variables are forced, or no longer.
+    Forced,
+    /// An input became bad or good.
+    InputQuality,
+    /// The recorder lost messages or could not write.
+    RecorderFault,
+    /// UTC against CLOCK_MONOTONIC, at start and when it jumps.
+    ClockOffset,
+    /// A client connected, left or was refused.
+    Client,
+    /// A bus changed state.
+    BusState,
+}
+
+/// The JSON body of an event.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct EventBody {
+    pub event: EventKind,
+    pub level: Level,
+    /// The service it is about.
+    pub service: String,
+    /// One sentence for people.
+    pub message: String,
+    /// UTC in ns.
+    pub utc_ns: i64,
+    /// CLOCK_MONOTONIC in ns.
+    pub t_ns: u64,
+    /// More, by kind.
+    #[serde(default, skip_serializing_if = "Value::is_null")]
+    pub detail: Value,
+}
+
+impl EventBody {
+    /// An event of now.
+    pub fn now(
+        event: EventKind,
+        level: Level,
+        service: &str,
+        message: impl Into<String>,
+        detail: Value,
+    ) -> Self {
+        Self {
+            event,
+            level,
+            service: service.to_owned(),
+            message: message.into(),
+            utc_ns: crate::clock::utc_ns(),
+            t_ns: crate::clock::mono_ns(),
+            detail,
+        }
+    }
+}

@@ -1,0 +1,105 @@
+//! Bus frames.
+
+use super::payload;
+
+/// Flags in [`CanFrame::can_id`], as Linux has them (`linux/can.h`).
+pub mod id_flag {
+    /// Extended frame format, 29 bits.
+    pub const EFF: u32 = 0x8000_0000;
+    /// Remote transmission request.
+    pub const RTR: u32 = 0x4000_0000;
+    /// Error frame.
+    pub const ERR: u32 = 0x2000_0000;
+    /// Identifier bits of an extended frame.
+    pub const EFF_MASK: u32 = 0x1FFF_FFFF;
+    /// Identifier bits of a standard frame.
+    pub const SFF_MASK: u32 = 0x7FF;
+}
+
+/// Flags in [`CanFrame::fd_flags`], as Linux has them.
+pub mod fd_flag {
+    /// Bit rate switch.
+    pub const BRS: u8 = 1;
+    /// Error state indicator.
+    pub const ESI: u8 = 2;
+    /// This is a CAN FD frame.
+    pub const FDF: u8 = 4;
+}
+
+/// Flags in [`CanFrame::flags`].
+pub mod can_flag {
+    /// On `rx`: this frame was sent by a process of the stack and has been on the bus.
+    pub const TX_ECHO: u8 = 1;
+    /// On `tx`: only the newest value of this identifier counts (cyclic PDO, PG): it takes the place of one
+    /// that still waits.
+    pub const NEWEST: u8 = 2;
+}
+
+payload! {
+    /// One CAN frame on `<can>/rx` or `<can>/tx`, classic or FD. 96 bytes.
+    ///
+    /// On `rx`, `stamp.t_ns` is when the frame was on the bus and `stamp.seq` is the bus's one true order.
+    pub struct CanFrame: "dinrail.CanFrame/1", fixed, Ros1 {
+        /// Identifier with [`id_flag`]s.
+        pub can_id: u32,
+        /// Bytes of data: 0-8 classic, 0-8, 12, 16, 20, 24, 32, 48, 64 FD. Of a remote frame: the length asked for.
+        pub len: u8,
+        /// [`fd_flag`]s; 0 is a classic frame.
+        pub fd_flags: u8,
+        /// [`can_flag`]s.
+        pub flags: u8,
+        /// Reserved, 0.
+        pub reserved: u8,
+        /// Data; bytes behind `len` are 0.
+        pub data: [u8; 64],
+    }
+}
+
+impl CanFrame {
+    /// A classic data frame. Longer data is cut at 8 bytes, identifiers above 7FFh become extended.
+    pub fn classic(id: u32, data: &[u8]) -> Self {
+        let can_id = if id & !id_flag::SFF_MASK == 0 { id } else { (id & id_flag::EFF_MASK) | id_flag::EFF };
+        let len = data.len().min(8);
+        let mut frame = Self { can_id, len: len as u8, ..Self::default() };
+        frame.data[..len].copy_from_slice(&data[..len]);
+        frame
+    }
+    /// Identifier without flags.
+    pub fn id(&self) -> u32 {
+        if self.is_extended() { self.can_id & id_flag::EFF_MASK } else { self.can_id & id_flag::SFF_MASK }
+    }
+    pub fn is_extended(&self) -> bool {
+        self.can_id & id_flag::EFF != 0
+    }
+    pub fn is_remote(&self) -> bool {
+        self.can_id & id_flag::RTR != 0
+    }
+    pub fn is_error(&self) -> bool {
+        self.can_id & id_flag::ERR != 0
+    }
+    pub fn is_fd(&self) -> bool {
+        self.fd_flags & fd_flag::FDF != 0
+    }
+    /// The data bytes; none for a remote frame. Never panics, whatever `len` says.
+    pub fn payload(&self) -> &[u8] {
+        let len = if self.is_remote() { 0 } else { usize::from(self.len).min(64) };
+        &self.data[..len]
+    }
+    /// What is wrong with the frame, if anything: a reader of shared memory validates before it believes.
+    pub fn fault(&self) -> Option<&'static str> {
+        if self.is_fd() {
+            if self.is_remote() {
+                return Some("CAN FD has no remote frames");
+            }
+            if !matches!(self.len, 0..=8 | 12 | 16 | 20 | 24 | 32 | 48 | 64) {
+                return Some("length is none of CAN FD's");
+            }
+        } else if self.len > 8 {
+            return Some("classic frame longer than 8 bytes");
+        }
+        if !self.is_extended() && !self.is_error() && self.can_id & id_flag::EFF_MASK > id_flag::SFF_MASK {
+            return Some("standard identifier above 7FFh");
+        }
+        None
+    }
+}

@@ -1,0 +1,1 @@
+//! Content of scan records and keyframes.

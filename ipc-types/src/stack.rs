@@ -1,0 +1,123 @@
+//! The resolved stack: what the launcher writes to `<root>/stack.json` and every process reads.
+
+use crate::topic::TopicKind;
+use crate::wiring::Wiring;
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+
+/// How grave a finding of `check` is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Severity {
+    /// Runs, but probably not as meant.
+    Warning,
+    /// The stack is refused.
+    Error,
+}
+
+/// Something that `check` found without starting anything.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Finding {
+    pub severity: Severity,
+    /// Service whose table it stands in.
+    pub service: String,
+    /// Path of the key in the service's table: `bus`, `in[2].to`; empty = the table itself. The launcher turns
+    /// it into `file:line`.
+    pub key: String,
+    /// What is wrong.
+    pub message: String,
+    /// What to do about it.
+    pub help: String,
+}
+
+impl Finding {
+    pub fn error(service: &str, key: &str, message: impl Into<String>, help: impl Into<String>) -> Self {
+        let (message, help) = (message.into(), help.into());
+        Self { severity: Severity::Error, service: service.to_owned(), key: key.to_owned(), message, help }
+    }
+    pub fn warning(service: &str, key: &str, message: impl Into<String>, help: impl Into<String>) -> Self {
+        Self { severity: Severity::Warning, ..Self::error(service, key, message, help) }
+    }
+}
+
+/// A service of the resolved stack.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct ServiceEntry {
+    pub name: String,
+    pub kind: String,
+    /// Writer number on the rail, from 1 (0 is the launcher).
+    pub index: u32,
+    /// The service's own table, without the launcher's keys.
+    pub config: serde_json::Value,
+    pub wiring: Wiring,
+}
+
+/// A consumer to wake for a topic.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Wake {
+    pub service: String,
+    /// Event id in the consumer's inbox.
+    pub event_id: u32,
+}
+
+/// A topic of the resolved stack.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct TopicEntry {
+    pub name: String,
+    pub kind: TopicKind,
+    pub depth: u32,
+    pub max_tail: u32,
+    pub writers: Vec<String>,
+    pub readers: Vec<String>,
+    pub wakes: Vec<Wake>,
+    /// Limits as created.
+    pub max_publishers: u32,
+    pub max_subscribers: u32,
+}
+
+impl TopicEntry {
+    /// Bytes of shared memory that its writers reserve when all of the stack's writers and reader slots exist.
+    pub fn bytes(&self) -> u64 {
+        // 64: iceoryx2's own header and alignment of a chunk.
+        let chunk = (self.kind.header_bytes() + self.max_tail as usize + 64) as u64;
+        let chunks = u64::from(self.max_subscribers) * (u64::from(self.depth) + 2) + 4;
+        self.writers.len().max(1) as u64 * chunk * chunks
+    }
+}
+
+/// The resolved stack.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Stack {
+    pub name: String,
+    /// The stack file, absolute; a name in angle brackets for an embedded one.
+    pub file: PathBuf,
+    /// Folder that relative paths of the stack file start from.
+    pub dir: PathBuf,
+    /// Text of the stack file as it was read.
+    pub text: String,
+    /// Identifies the executable: children of another build refuse to run.
+    pub build_id: String,
+    /// Folder of the stack in shared memory.
+    pub root: PathBuf,
+    /// Prefix of its objects in /dev/shm.
+    pub prefix: String,
+    pub services: Vec<ServiceEntry>,
+    pub topics: Vec<TopicEntry>,
+}
+
+impl Stack {
+    pub fn service(&self, name: &str) -> Option<&ServiceEntry> {
+        self.services.iter().find(|s| s.name == name)
+    }
+    pub fn topic(&self, name: &str) -> Option<&TopicEntry> {
+        self.topics.iter().find(|t| t.name == name)
+    }
+    /// Name of the service with this writer number, for messages.
+    pub fn writer_name(&self, writer: u32) -> String {
+        match self.services.iter().find(|s| s.index == writer) {
+            Some(service) => service.name.clone(),
+            None if writer == 0 => "launcher".to_owned(),
+            None => format!("pid {}", writer & 0x7FFF_FFFF),
+        }
+    }
+}

@@ -1,0 +1,1 @@
+//! Raw CAN frames and signals to and from the process image

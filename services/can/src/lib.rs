@@ -1,0 +1,3 @@
+//! CAN bus driver service
+
+pub mod protocol;

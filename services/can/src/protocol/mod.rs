@@ -1,0 +1,13 @@
+//! Sans-I/O codecs of the CAN driver: bytes and time in, frames and bytes out.
+//!
+//! Nothing in here owns a socket, reads a clock, allocates per frame or knows the rail. The same code serves
+//! the live driver, the command line, replay and the tests.
+
+pub mod busload;
+pub mod candump;
+pub mod frame;
+mod hex;
+pub mod slcan;
+pub mod socketcand;
+
+pub use frame::{Frame, FrameError};

@@ -1,0 +1,195 @@
+//! Responses: written by servers, read by clients.
+
+use super::pdu::{
+    COIL_ON, EXCEPTION_BIT, EncodeError, MAX_READ_BITS, MAX_READ_WORDS, MAX_WRITE_BITS, MAX_WRITE_WORDS, Request,
+    bytes_for_bits, function,
+};
+use super::wire::{Writer, u16_at};
+
+/// A response. Coil values are packed low bit first, register values are the wire's big-endian bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Response<'a> {
+    /// Function 1; bits beyond the quantity asked for are zero.
+    ReadCoils(&'a [u8]),
+    /// Function 2; bits beyond the quantity asked for are zero.
+    ReadDiscreteInputs(&'a [u8]),
+    /// Function 3.
+    ReadHoldingRegisters(&'a [u8]),
+    /// Function 4.
+    ReadInputRegisters(&'a [u8]),
+    /// Function 5, echo of the request.
+    WriteSingleCoil { address: u16, on: bool },
+    /// Function 6, echo of the request.
+    WriteSingleRegister { address: u16, value: u16 },
+    /// Function 15.
+    WriteMultipleCoils { address: u16, quantity: u16 },
+    /// Function 16.
+    WriteMultipleRegisters { address: u16, quantity: u16 },
+    /// Function 22, echo of the request.
+    MaskWriteRegister { address: u16, and_mask: u16, or_mask: u16 },
+    /// Function 23, the registers read.
+    ReadWriteMultipleRegisters(&'a [u8]),
+    /// Any function: `function` without the top bit, `code` as received (it need not be a known one).
+    Exception { function: u8, code: u8 },
+}
+
+/// A response that does not belong to its request.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum ResponseError {
+    /// No function code at all.
+    #[error("the response is empty")]
+    Empty,
+    /// The function code is neither the request's nor its exception's.
+    #[error("the response is to function {got} but function {expected} was asked; drop the connection")]
+    Function { expected: u8, got: u8 },
+    /// Too short, too long, or a byte count that does not fit what was asked.
+    #[error("the response to function {function} has the wrong length or byte count; drop the connection")]
+    Length { function: u8 },
+    /// An echo that differs from the request.
+    #[error("the response to function {function} repeats another address, quantity or value than asked")]
+    Echo { function: u8 },
+}
+
+impl Response<'_> {
+    /// Function code on the wire, exception bit included.
+    pub fn function(&self) -> u8 {
+        match self {
+            Self::ReadCoils(_) => function::READ_COILS,
+            Self::ReadDiscreteInputs(_) => function::READ_DISCRETE_INPUTS,
+            Self::ReadHoldingRegisters(_) => function::READ_HOLDING_REGISTERS,
+            Self::ReadInputRegisters(_) => function::READ_INPUT_REGISTERS,
+            Self::WriteSingleCoil { .. } => function::WRITE_SINGLE_COIL,
+            Self::WriteSingleRegister { .. } => function::WRITE_SINGLE_REGISTER,
+            Self::WriteMultipleCoils { .. } => function::WRITE_MULTIPLE_COILS,
+            Self::WriteMultipleRegisters { .. } => function::WRITE_MULTIPLE_REGISTERS,
+            Self::MaskWriteRegister { .. } => function::MASK_WRITE_REGISTER,
+            Self::ReadWriteMultipleRegisters(_) => function::READ_WRITE_MULTIPLE_REGISTERS,
+            Self::Exception { function, .. } => function | EXCEPTION_BIT,
+        }
+    }
+
+    fn is_legal(&self) -> bool {
+        match *self {
+            Self::ReadCoils(bytes) | Self::ReadDiscreteInputs(bytes) => {
+                (1..=bytes_for_bits(MAX_READ_BITS)).contains(&bytes.len())
+            }
+            Self::ReadHoldingRegisters(bytes)
+            | Self::ReadInputRegisters(bytes)
+            | Self::ReadWriteMultipleRegisters(bytes) => {
+                bytes.len() % 2 == 0 && (1..=usize::from(MAX_READ_WORDS)).contains(&(bytes.len() / 2))
+            }
+            Self::WriteMultipleCoils { quantity, .. } => (1..=MAX_WRITE_BITS).contains(&quantity),
+            Self::WriteMultipleRegisters { quantity, .. } => (1..=MAX_WRITE_WORDS).contains(&quantity),
+            Self::WriteSingleCoil { .. }
+            | Self::WriteSingleRegister { .. }
+            | Self::MaskWriteRegister { .. }
+            | Self::Exception { .. } => true,
+        }
+    }
+}
+
+/// Writes a response PDU into `out` ([`super::pdu::MAX_PDU`] bytes always suffice) and returns its length.
+pub fn encode_response(response: &Response<'_>, out: &mut [u8]) -> Result<usize, EncodeError> {
+    if !response.is_legal() {
+        return Err(EncodeError::Limits { function: response.function() });
+    }
+    let mut w = Writer::new(out);
+    w.u8(response.function())?;
+    match *response {
+        Response::ReadCoils(bytes)
+        | Response::ReadDiscreteInputs(bytes)
+        | Response::ReadHoldingRegisters(bytes)
+        | Response::ReadInputRegisters(bytes)
+        | Response::ReadWriteMultipleRegisters(bytes) => {
+            w.u8(bytes.len() as u8)?;
+            w.bytes(bytes)?;
+        }
+        Response::WriteSingleCoil { address, on } => {
+            w.u16(address)?;
+            w.u16(if on { COIL_ON } else { 0 })?;
+        }
+        Response::WriteSingleRegister { address, value } => {
+            w.u16(address)?;
+            w.u16(value)?;
+        }
+        Response::WriteMultipleCoils { address, quantity }
+        | Response::WriteMultipleRegisters { address, quantity } => {
+            w.u16(address)?;
+            w.u16(quantity)?;
+        }
+        Response::MaskWriteRegister { address, and_mask, or_mask } => {
+            w.u16(address)?;
+            w.u16(and_mask)?;
+            w.u16(or_mask)?;
+        }
+        Response::Exception { code, .. } => w.u8(code)?,
+    }
+    Ok(w.len())
+}
+
+/// Reads the response PDU to `request`, function code first, and checks that it can be the answer to it.
+pub fn decode_response<'a>(request: &Request<'_>, pdu: &'a [u8]) -> Result<Response<'a>, ResponseError> {
+    let (&got, data) = pdu.split_first().ok_or(ResponseError::Empty)?;
+    let asked = request.function();
+    if got == asked | EXCEPTION_BIT {
+        return match data {
+            &[code] => Ok(Response::Exception { function: asked, code }),
+            _ => Err(ResponseError::Length { function: asked }),
+        };
+    }
+    if got != asked {
+        return Err(ResponseError::Function { expected: asked, got });
+    }
+    let response = match *request {
+        Request::ReadCoils { quantity, .. } => Response::ReadCoils(counted(asked, data, bytes_for_bits(quantity))?),
+        Request::ReadDiscreteInputs { quantity, .. } => {
+            Response::ReadDiscreteInputs(counted(asked, data, bytes_for_bits(quantity))?)
+        }
+        Request::ReadHoldingRegisters { quantity, .. } => {
+            Response::ReadHoldingRegisters(counted(asked, data, usize::from(quantity) * 2)?)
+        }
+        Request::ReadInputRegisters { quantity, .. } => {
+            Response::ReadInputRegisters(counted(asked, data, usize::from(quantity) * 2)?)
+        }
+        Request::ReadWriteMultipleRegisters { read_quantity, .. } => {
+            Response::ReadWriteMultipleRegisters(counted(asked, data, usize::from(read_quantity) * 2)?)
+        }
+        Request::WriteSingleCoil { address, on } => {
+            echo(asked, data, &[address, if on { COIL_ON } else { 0 }])?;
+            Response::WriteSingleCoil { address, on }
+        }
+        Request::WriteSingleRegister { address, value } => {
+            echo(asked, data, &[address, value])?;
+            Response::WriteSingleRegister { address, value }
+        }
+        Request::WriteMultipleCoils { address, quantity, .. } => {
+            echo(asked, data, &[address, quantity])?;
+            Response::WriteMultipleCoils { address, quantity }
+        }
+        Request::WriteMultipleRegisters { address, values } => {
+            let quantity = (values.len() / 2) as u16;
+            echo(asked, data, &[address, quantity])?;
+            Response::WriteMultipleRegisters { address, quantity }
+        }
+        Request::MaskWriteRegister { address, and_mask, or_mask } => {
+            echo(asked, data, &[address, and_mask, or_mask])?;
+            Response::MaskWriteRegister { address, and_mask, or_mask }
+        }
+    };
+    Ok(response)
+}
+
+fn counted(function: u8, data: &[u8], expected: usize) -> Result<&[u8], ResponseError> {
+    match data.split_first() {
+        Some((&count, bytes)) if usize::from(count) == expected && bytes.len() == expected => Ok(bytes),
+        _ => Err(ResponseError::Length { function }),
+    }
+}
+
+fn echo(function: u8, data: &[u8], words: &[u16]) -> Result<(), ResponseError> {
+    if data.len() != words.len() * 2 {
+        return Err(ResponseError::Length { function });
+    }
+    let same = words.iter().enumerate().all(|(i, &word)| u16_at(data, i * 2) == Some(word));
+    if same { Ok(()) } else { Err(ResponseError::Echo { function }) }
+}

@@ -1,0 +1,1 @@
+//! PLC scan engine, process image and routes
