@@ -1,0 +1,146 @@
+//! A whole rail in one process: topics made with their limits, messages numbered, gaps counted, full queues
+//! refused, consumers woken. One test function, because a process belongs to one rail for its whole life.
+
+use ipc_types::Context;
+use ipc_types::payload::{CanFrame, Event, Inputs};
+use ipc_types::port::SendError;
+use ipc_types::reactor::Reactor;
+use ipc_types::stack::{ServiceEntry, Stack, TopicEntry, Wake};
+use ipc_types::topic::{EVENTS, TopicKind};
+use ipc_types::{Wiring, rail};
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::Duration;
+
+fn topic(kind: TopicKind, service: &str, depth: u32, wakes: Vec<Wake>) -> TopicEntry {
+    let (max_publishers, max_subscribers) = rail::port_limits(kind, 2, 2);
+    TopicEntry {
+        name: if kind == TopicKind::Events { EVENTS.to_owned() } else { kind.of(service) },
+        kind,
+        depth,
+        max_tail: kind.row().max_tail,
+        writers: vec![service.to_owned()],
+        readers: Vec::new(),
+        wakes,
+        max_publishers,
+        max_subscribers,
+    }
+}
+
+struct Wipe(PathBuf, String);
+impl Drop for Wipe {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+        for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
+            if entry.file_name().to_string_lossy().starts_with(&self.1) {
+                let _ = std::fs::remove_file(entry.path());
+            }
+        }
+    }
+}
+
+#[test]
+fn the_rail_carries_numbers_refuses_and_wakes() {
+    let name = format!("railtest{}", std::process::id());
+    let (root, prefix) = rail::place(0, &name);
+    let _wipe = Wipe(root.clone(), prefix.clone());
+    std::fs::create_dir_all(&root).unwrap();
+    std::fs::write(root.join(rail::CONFIG_FILE), rail::config_text(&root, &prefix)).unwrap();
+    let wake = vec![Wake { service: "a".into(), event_id: 3 }];
+    let stack = Stack {
+        name,
+        file: "test".into(),
+        dir: ".".into(),
+        text: String::new(),
+        build_id: "test".into(),
+        root: root.clone(),
+        prefix,
+        services: vec![ServiceEntry {
+            name: "a".into(),
+            kind: "test".into(),
+            index: 1,
+            config: serde_json::Value::Null,
+            wiring: Wiring::default(),
+        }],
+        topics: vec![
+            topic(TopicKind::Events, "stack", 16, vec![]),
+            topic(TopicKind::Health, "a", 4, vec![]),
+            topic(TopicKind::Status, "a", 4, vec![]),
+            topic(TopicKind::CanRx, "can0", 8, wake.clone()),
+            topic(TopicKind::CanTx, "can0", 4, wake),
+            topic(TopicKind::Inputs, "io", 2, vec![]),
+        ],
+    };
+    std::fs::write(root.join(rail::STACK_FILE), serde_json::to_vec(&stack).unwrap()).unwrap();
+    rail::join(&root).unwrap();
+    let launcher = rail::node("launcher").unwrap();
+    let mut held: Vec<_> = stack.topics.iter().map(|t| rail::create_topic(&launcher, t).unwrap()).collect();
+    held.push(rail::create_inbox(&launcher, "a", 4).unwrap());
+
+    let mut ctx = Context::service(&root, "a", 1, BTreeMap::new()).unwrap();
+    let mut inbox = ctx.inbox().unwrap();
+    let mut reactor = Reactor::new().unwrap();
+    let token = reactor.add(inbox.fd()).unwrap();
+
+    // Replace-the-oldest: the reader sees the newest and counts what it missed.
+    let mut rx = ctx.subscriber::<CanFrame>("can0/rx").unwrap();
+    let mut port = ctx.publisher::<CanFrame>("can0/rx").unwrap();
+    for n in 0..20u8 {
+        port.send(CanFrame::classic(0x123, &[n])).unwrap();
+        if n == 1 {
+            assert_eq!(rx.drain(100, |_, _| {}), 2);
+        }
+    }
+    port.ring();
+    assert!(reactor.wait(Some(Duration::from_secs(10))).unwrap().contains(&token));
+    assert_eq!(inbox.drain(), 1 << 3);
+    assert!(reactor.wait(Some(Duration::ZERO)).unwrap().is_empty(), "the inbox was drained");
+    let mut got = Vec::new();
+    rx.drain(100, |frame, tail| {
+        assert!(tail.is_empty());
+        got.push((frame.stamp.seq, frame.data[0]));
+    });
+    assert_eq!(got, (12..20u8).map(|n| (u64::from(n) + 1, n)).collect::<Vec<_>>());
+    assert_eq!(rx.counters().lost, 10);
+
+    // Refuse: told when there is no reader, and when its queue is full; nothing is consumed by a refusal.
+    let mut tx = ctx.publisher::<CanFrame>("can0/tx").unwrap();
+    assert!(matches!(tx.send(CanFrame::default()), Err(SendError::NoReader(_))));
+    let mut driver = ctx.subscriber::<CanFrame>("can0/tx").unwrap();
+    let sent = (0..10).take_while(|_| tx.send(CanFrame::default()).is_ok()).count();
+    assert_eq!(sent, 4, "the queue holds its depth");
+    assert!(matches!(tx.send(CanFrame::default()), Err(SendError::Full(_))));
+    let mut seqs = Vec::new();
+    driver.drain(100, |frame, _| seqs.push(frame.stamp.seq));
+    assert_eq!(seqs, [1, 2, 3, 4]);
+    assert_eq!(tx.send(CanFrame::default()), Ok(5));
+
+    // History: a late reader gets the newest at once; tails travel.
+    let mut inputs = ctx.publisher::<Inputs>("io/inputs").unwrap();
+    for n in 0..5u8 {
+        inputs.send_tail(Inputs { ranges: 1, ..Inputs::default() }, &[n, 0]).unwrap();
+    }
+    let mut late = ctx.subscriber::<Inputs>("io/inputs").unwrap();
+    inputs.send_tail(Inputs { ranges: 1, ..Inputs::default() }, &[9, 0]).unwrap();
+    let mut tails = Vec::new();
+    late.drain(10, |header, tail| tails.push((header.n, tail.to_vec())));
+    assert_eq!(tails.last().unwrap(), &(2, vec![9, 0]));
+    assert!(matches!(inputs.send_tail(Inputs::default(), &[0; 5000]), Err(SendError::TooLong { .. })));
+
+    // Events and a reader that knows no type.
+    let mut raw = ctx.raw_subscriber(EVENTS).unwrap();
+    ctx.event(
+        ipc_types::event::EventKind::Ready,
+        ipc_types::event::Level::Info,
+        "works",
+        serde_json::json!({"x": 1}),
+    );
+    let mut bodies = Vec::new();
+    raw.drain_raw(10, &mut |stamp, header, tail| {
+        assert_eq!(header.len(), size_of::<Event>());
+        assert_eq!(stamp.writer, 1);
+        bodies.push(serde_json::from_slice::<serde_json::Value>(tail).unwrap());
+    });
+    assert_eq!(bodies[0]["message"], "works");
+    assert!(ctx.subscriber::<Inputs>("can0/rx").is_err(), "another payload is refused");
+}
