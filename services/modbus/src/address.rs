@@ -1,29 +1,9 @@
 //! %-addresses of the stack file and where their bytes are.
 
+pub use ipc_types::wiring::Area;
+
 use serde::{Deserialize, Serialize};
 use std::fmt;
-
-/// One of the three areas of the process image.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub enum Area {
-    /// %I
-    Input,
-    /// %Q
-    Output,
-    /// %M
-    Marker,
-}
-
-impl Area {
-    /// The letter behind the %.
-    pub fn letter(self) -> char {
-        match self {
-            Self::Input => 'I',
-            Self::Output => 'Q',
-            Self::Marker => 'M',
-        }
-    }
-}
 
 /// Bytes of each area, at most 64 KiB.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,8 +24,13 @@ impl AreaSizes {
     }
 }
 
+impl AreaSizes {
+    /// The largest areas a plc service can have.
+    pub const MAX: Self = Self { input: 65536, output: 65536, marker: 65536 };
+}
+
 impl Default for AreaSizes {
-    /// 4 KiB each.
+    /// 4 KiB each, the plc service's default.
     fn default() -> Self {
         Self { input: 4096, output: 4096, marker: 4096 }
     }
@@ -97,6 +82,34 @@ pub enum Addressing {
     Element,
     /// In bytes: %IW2 = bytes 2-3 (OpenPCS, Siemens).
     Byte,
+    /// As OpenPLC: each size has a table of its own with 1024 elements; they lie behind one another in the area
+    /// (X from byte 0, W from 1024, B from 3072, D from 4096, L from 8192).
+    Openplc,
+}
+
+/// Elements of each of OpenPLC's tables (bytes of them for bits).
+pub const OPENPLC_ELEMENTS: u32 = 1024;
+
+impl Addressing {
+    /// First byte of the values of a width.
+    pub fn base(self, width: Width) -> u32 {
+        match (self, width) {
+            (Self::Element | Self::Byte, _) | (Self::Openplc, Width::Bit) => 0,
+            (Self::Openplc, Width::Word) => 1024,
+            (Self::Openplc, Width::Byte) => 3072,
+            (Self::Openplc, Width::Double) => 4096,
+            (Self::Openplc, Width::Long) => 8192,
+        }
+    }
+
+    /// Bytes that the values of a width may take in an area of `size` bytes, from [`Addressing::base`] on.
+    pub fn room(self, width: Width, size: u32) -> u32 {
+        let room = size.saturating_sub(self.base(width));
+        match self {
+            Self::Element | Self::Byte => room,
+            Self::Openplc => room.min(OPENPLC_ELEMENTS * width.bytes()),
+        }
+    }
 }
 
 /// A %-address resolved to bytes.
@@ -119,6 +132,8 @@ pub enum AddressError {
     Form(String),
     #[error("'{text}': bits are 0 to 7; bit {bit} of byte {byte} is {meant}")]
     Bit { text: String, byte: u32, bit: u32, meant: String },
+    #[error("'{0}': OpenPLC's tables have {OPENPLC_ELEMENTS} elements, 0 to 1023")]
+    OutsideTable(String),
 }
 
 impl Address {
@@ -143,10 +158,13 @@ impl Address {
             Some(c) if c.is_ascii_digit() && addressing == Addressing::Byte => Width::Bit,
             _ => return Err(form()),
         };
-        let number = rest.trim_start_matches(|c: char| c.is_ascii_alphabetic());
+        let number = rest.strip_prefix(|c: char| c.is_ascii_alphabetic()).unwrap_or(rest);
         if width == Width::Bit {
             let (byte, bit) = number.split_once('.').ok_or_else(form)?;
             let (byte, bit) = (decimal(byte).ok_or_else(form)?, decimal(bit).ok_or_else(form)?);
+            if addressing == Addressing::Openplc && byte >= OPENPLC_ELEMENTS {
+                return Err(AddressError::OutsideTable(text.to_owned()));
+            }
             if bit > 7 {
                 let meant = format!("%{}X{}.{}", area.letter(), byte.saturating_add(bit / 8), bit % 8);
                 return Err(AddressError::Bit { text: text.to_owned(), byte, bit, meant });
@@ -154,9 +172,12 @@ impl Address {
             return Ok(Self { area, width, byte, bit: bit as u8 });
         }
         let number = decimal(number).ok_or_else(form)?;
+        if addressing == Addressing::Openplc && number >= OPENPLC_ELEMENTS {
+            return Err(AddressError::OutsideTable(text.to_owned()));
+        }
         let byte = match addressing {
-            Addressing::Element => number.checked_mul(width.bytes()).ok_or_else(form)?,
             Addressing::Byte => number,
+            Addressing::Element | Addressing::Openplc => addressing.base(width) + number * width.bytes(),
         };
         Ok(Self { area, width, byte, bit: 0 })
     }
@@ -164,8 +185,10 @@ impl Address {
     /// The address as text, in the given way of counting.
     pub fn text(self, addressing: Addressing) -> String {
         let n = match addressing {
-            Addressing::Element => self.byte / self.width.bytes(),
             Addressing::Byte => self.byte,
+            Addressing::Element | Addressing::Openplc => {
+                self.byte.saturating_sub(addressing.base(self.width)) / self.width.bytes()
+            }
         };
         match self.width {
             Width::Bit => format!("%{}X{}.{}", self.area.letter(), self.byte, self.bit),
@@ -201,6 +224,10 @@ mod tests {
             ("%QX3.7", Addressing::Element, Area::Output, 3, 7),
             ("%I0.5", Addressing::Byte, Area::Input, 0, 5),
             ("%qx1.0", Addressing::Byte, Area::Output, 1, 0),
+            ("%QX1.0", Addressing::Openplc, Area::Output, 1, 0),
+            ("%MW1", Addressing::Openplc, Area::Marker, 1026, 0),
+            ("%MD1", Addressing::Openplc, Area::Marker, 4100, 0),
+            ("%ML1", Addressing::Openplc, Area::Marker, 8200, 0),
         ] {
             let address = Address::parse(text, addressing).unwrap();
             assert_eq!((address.area, address.byte, address.bit), (area, byte, bit), "{text}");
@@ -211,14 +238,37 @@ mod tests {
     fn a_bad_address_says_what_is_meant() {
         let error = |text| Address::parse(text, Addressing::Element).unwrap_err().to_string();
         assert_eq!(error("%QX0.12"), "'%QX0.12': bits are 0 to 7; bit 12 of byte 0 is %QX1.4");
-        for bad in ["", "%", "MW1", "%MW", "%XW1", "%M", "%MW1.2", "%MW-1", "%QX0", "%QX.1", "%MW99999999", "%I0.5", "%MWW1", "%é1"] {
+        for bad in [
+            "",
+            "%",
+            "MW1",
+            "%MW",
+            "%XW1",
+            "%M",
+            "%MW1.2",
+            "%MW-1",
+            "%QX0",
+            "%QX.1",
+            "%MW99999999",
+            "%I0.5",
+            "%MWW1",
+            "%é1",
+        ] {
             assert!(error(bad).contains("e.g. \"%MW0\""), "{bad}: {}", error(bad));
         }
     }
 
     #[test]
+    fn openplc_tables_end() {
+        for text in ["%MW1024", "%QX1024.0"] {
+            let error = Address::parse(text, Addressing::Openplc).unwrap_err();
+            assert_eq!(error, AddressError::OutsideTable(text.to_owned()));
+        }
+    }
+
+    #[test]
     fn text_is_parsed_back() {
-        for addressing in [Addressing::Element, Addressing::Byte] {
+        for addressing in [Addressing::Element, Addressing::Byte, Addressing::Openplc] {
             for text in ["%MW10", "%QX3.7", "%IB9", "%MD3", "%ML2"] {
                 assert_eq!(Address::parse(text, addressing).unwrap().text(addressing), text);
             }

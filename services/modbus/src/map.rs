@@ -73,21 +73,46 @@ impl<'a> Memory<'a> {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RegisterMap {
     tables: [Vec<Range>; 4],
+    sizes: AreaSizes,
 }
 
 impl RegisterMap {
     /// One of the two ready maps, clipped to the sizes of the areas.
-    pub fn preset(preset: Preset, sizes: AreaSizes) -> Self {
-        crate::map_config::preset(preset, sizes)
+    pub fn preset(preset: Preset, sizes: AreaSizes, addressing: Addressing) -> Self {
+        crate::map_config::preset(preset, sizes, addressing)
     }
 
     /// A map from tables of the stack file.
-    pub fn from_entries(entries: &[MapEntry], sizes: AreaSizes, addressing: Addressing) -> Result<Self, MapError> {
+    pub fn from_entries(
+        entries: &[MapEntry],
+        sizes: AreaSizes,
+        addressing: Addressing,
+    ) -> Result<Self, MapError> {
         crate::map_config::from_entries(entries, sizes, addressing)
     }
 
-    pub(crate) fn from_ranges(tables: [Vec<Range>; 4]) -> Self {
-        Self { tables }
+    pub(crate) fn from_ranges(tables: [Vec<Range>; 4], sizes: AreaSizes) -> Self {
+        Self { tables, sizes }
+    }
+
+    /// Sizes of the areas that entries must lie in.
+    pub fn sizes(&self) -> AreaSizes {
+        self.sizes
+    }
+
+    /// Tells the map how large the PLC's areas really are; entries beyond get exception 02.
+    pub fn set_sizes(&mut self, sizes: AreaSizes) {
+        self.sizes = sizes;
+    }
+
+    /// Entries of a range that lie within its area.
+    pub(crate) fn entries_inside(&self, table: Table, range: &Range) -> u32 {
+        let size = self.sizes.of(range.area);
+        if table.is_bits() {
+            (size * 8).saturating_sub(range.base).min(range.count)
+        } else {
+            (size.saturating_sub(range.base) / 2).min(range.count) / range.group * range.group
+        }
     }
 
     pub(crate) fn ranges(&self, table: Table) -> &[Range] {
@@ -136,11 +161,14 @@ impl RegisterMap {
         Ok(())
     }
 
-    /// Whether all entries exist, and for a write, whether all may be written and go to one destination: a
+    /// Whether all entries exist and lie within the areas, and for a write, whether all may be written and go to one destination: a
     /// request that crosses from %Q or %M into %I owned by the server could not be applied whole.
     pub fn check(&self, access: Access, table: Table, address: u16, quantity: u16) -> Result<(), Exception> {
         let mut own = None;
-        self.parts(table, address, u32::from(quantity), |range, _, _| {
+        self.parts(table, address, u32::from(quantity), |range, first, n| {
+            if first + n > self.entries_inside(table, range) {
+                return Err(Exception::IllegalDataAddress);
+            }
             if access == Access::Write && (!range.writable() || *own.get_or_insert(range.own) != range.own) {
                 return Err(Exception::IllegalDataAddress);
             }

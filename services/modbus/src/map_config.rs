@@ -101,7 +101,7 @@ impl MapConfig {
     /// The map for areas of these sizes.
     pub fn build(&self, sizes: AreaSizes, addressing: Addressing) -> Result<RegisterMap, MapError> {
         match self {
-            Self::Preset(chosen) => Ok(preset(*chosen, sizes)),
+            Self::Preset(chosen) => Ok(preset(*chosen, sizes, addressing)),
             Self::Tables(entries) => from_entries(entries, sizes, addressing),
         }
     }
@@ -120,17 +120,23 @@ pub enum MapError {
         "map table {entry}: {table} {at} to {last} reaches byte {end} of %{area}, which has {size}; lower count or raise the size of %{area} in the plc service"
     )]
     PastArea { entry: usize, table: &'static str, at: u32, last: u32, end: u64, area: char, size: u32 },
-    #[error("map table {entry}: {table} shows single bits, so area must be %{area}X... or %{area}B...; got {got}")]
+    #[error(
+        "map table {entry}: {table} shows single bits, so area must be %{area}X... or %{area}B...; got {got}"
+    )]
     NotBits { entry: usize, table: &'static str, area: char, got: String },
     #[error("map table {entry}: {table} shows 16-bit words, so area must be %{area}B, W, D or L; got {got}")]
     NotWords { entry: usize, table: &'static str, area: char, got: String },
-    #[error("map table {entry}: word_order needs values of 32 or 64 bits; write area as %xD or %xL, got {got}")]
+    #[error(
+        "map table {entry}: word_order needs values of 32 or 64 bits; write area as %xD or %xL, got {got}"
+    )]
     WordOrder { entry: usize, got: String },
     #[error("map table {entry}: count {count} splits a value; %xD needs a multiple of 2, %xL of 4")]
     SplitsValue { entry: usize, count: u32 },
     #[error("map table {entry}: swap_bytes is for registers, {table} shows single bits")]
     SwapBits { entry: usize, table: &'static str },
-    #[error("map table {entry}: own = true is for %I in coils or holding_registers, which clients can write; got {got} in {table}")]
+    #[error(
+        "map table {entry}: own = true is for %I in coils or holding_registers, which clients can write; got {got} in {table}"
+    )]
     Own { entry: usize, table: &'static str, got: String },
     #[error("map tables {first} and {second} both show {table} {at}; a register has one place")]
     Overlap { first: usize, second: usize, table: &'static str, at: u32 },
@@ -142,37 +148,28 @@ pub enum MapError {
     TooMany { got: usize },
 }
 
-/// Registers or bits that fit into `size` bytes, at most `most`.
-fn clipped(most: u32, size: u32, per_entry_bits: u32) -> u32 {
-    most.min(size * 8 / per_entry_bits)
-}
-
-pub(crate) fn preset(preset: Preset, sizes: AreaSizes) -> RegisterMap {
-    let range = |at, most, area, base, width: Width| {
-        let bits = if width == Width::Bit { 1 } else { 16 };
+pub(crate) fn preset(preset: Preset, sizes: AreaSizes, addressing: Addressing) -> RegisterMap {
+    let range = |at, most: u32, area, width: Width| {
+        let entry_bits = if width == Width::Bit { 1 } else { 16 };
         let group = (width.bytes() / 2).max(1);
-        let room = sizes.of(area).saturating_sub(base);
-        let count = clipped(most, room, bits) / group * group;
-        let high_first = group > 1;
-        Range { at, count, area, base, group, high_first, swap_bytes: false, own: false }
+        let count = most.min(addressing.room(width, sizes.of(area)) * 8 / entry_bits) / group * group;
+        let base = addressing.base(width);
+        Range { at, count, area, base, group, high_first: group > 1, swap_bytes: false, own: false }
     };
-    let coils = range(0, TABLE_ENTRIES, Area::Output, 0, Width::Bit);
-    let discrete = range(0, TABLE_ENTRIES, Area::Input, 0, Width::Bit);
+    let coils = range(0, TABLE_ENTRIES, Area::Output, Width::Bit);
+    let discrete = range(0, TABLE_ENTRIES, Area::Input, Width::Bit);
     let (input, holding) = match preset {
         Preset::Dinrail => (
-            range(0, TABLE_ENTRIES, Area::Input, 0, Width::Word),
-            vec![
-                range(0, 32768, Area::Marker, 0, Width::Word),
-                range(32768, 32768, Area::Output, 0, Width::Word),
-            ],
+            range(0, TABLE_ENTRIES, Area::Input, Width::Word),
+            vec![range(0, 32768, Area::Marker, Width::Word), range(32768, 32768, Area::Output, Width::Word)],
         ),
         Preset::Openplc => (
-            range(0, 1024, Area::Input, 0, Width::Word),
+            range(0, 1024, Area::Input, Width::Word),
             vec![
-                range(0, 1024, Area::Output, 0, Width::Word),
-                range(1024, 1024, Area::Marker, 0, Width::Word),
-                range(2048, 2048, Area::Marker, 0, Width::Double),
-                range(4096, 4096, Area::Marker, 0, Width::Long),
+                range(0, 1024, Area::Output, Width::Word),
+                range(1024, 1024, Area::Marker, Width::Word),
+                range(2048, 2048, Area::Marker, Width::Double),
+                range(4096, 4096, Area::Marker, Width::Long),
             ],
         ),
     };
@@ -180,7 +177,7 @@ pub(crate) fn preset(preset: Preset, sizes: AreaSizes) -> RegisterMap {
     for ranges in &mut tables {
         ranges.retain(|range| range.count > 0);
     }
-    RegisterMap::from_ranges(tables)
+    RegisterMap::from_ranges(tables, sizes)
 }
 
 pub(crate) fn from_entries(
@@ -202,11 +199,17 @@ pub(crate) fn from_entries(
             if let [(first, a), (second, b)] = pair
                 && b.at < a.at + a.count
             {
-                return Err(MapError::Overlap { first: *first, second: *second, table: table.name(), at: b.at });
+                return Err(MapError::Overlap {
+                    first: *first,
+                    second: *second,
+                    table: table.name(),
+                    at: b.at,
+                });
             }
         }
     }
-    Ok(RegisterMap::from_ranges(numbered.map(|ranges| ranges.into_iter().map(|(_, range)| range).collect())))
+    let tables = numbered.map(|ranges| ranges.into_iter().map(|(_, range)| range).collect());
+    Ok(RegisterMap::from_ranges(tables, sizes))
 }
 
 fn entry_range(
@@ -237,7 +240,7 @@ fn entry_range(
     if config.word_order.is_some() && group == 1 {
         return Err(MapError::WordOrder { entry, got: got() });
     }
-    if config.count % group != 0 {
+    if !config.count.is_multiple_of(group) {
         return Err(MapError::SplitsValue { entry, count: config.count });
     }
     if bits && config.swap_bytes {
@@ -256,7 +259,7 @@ fn entry_range(
         if address.area != Area::Input || !client_writes {
             return Err(MapError::Own { entry, table, got: got() });
         }
-        if bits && (address.bit != 0 || config.count % 8 != 0) {
+        if bits && (address.bit != 0 || !config.count.is_multiple_of(8)) {
             return Err(MapError::OwnBits { entry });
         }
     }
@@ -298,16 +301,45 @@ pub struct MapRow {
 /// suffice, else six ("40001", "432769").
 pub fn traditional_number(table: Table, address: u16) -> String {
     let number = u32::from(address) + 1;
-    if number <= 9999 { format!("{}{number:04}", table.digit()) } else { format!("{}{number:05}", table.digit()) }
+    if number <= 9999 {
+        format!("{}{number:04}", table.digit())
+    } else {
+        format!("{}{number:05}", table.digit())
+    }
+}
+
+impl MapError {
+    /// The `[[service.map]]` table it is about, from 1.
+    pub fn entry(&self) -> Option<usize> {
+        match self {
+            Self::Address { entry, .. }
+            | Self::Empty { entry }
+            | Self::PastTable { entry, .. }
+            | Self::PastArea { entry, .. }
+            | Self::NotBits { entry, .. }
+            | Self::NotWords { entry, .. }
+            | Self::WordOrder { entry, .. }
+            | Self::SplitsValue { entry, .. }
+            | Self::SwapBits { entry, .. }
+            | Self::Own { entry, .. }
+            | Self::OwnBits { entry } => Some(*entry),
+            Self::Overlap { second, .. } => Some(*second),
+            Self::TooMany { .. } => None,
+        }
+    }
 }
 
 impl RegisterMap {
-    /// All ranges, table by table.
+    /// All ranges, table by table, as far as they lie within the areas.
     pub fn rows(&self, addressing: Addressing) -> Vec<MapRow> {
         let mut rows = Vec::new();
         for table in Table::ALL {
             for range in self.ranges(table) {
-                let (first, last) = (range.at as u16, (range.at + range.count - 1) as u16);
+                let count = self.entries_inside(table, range);
+                if count == 0 {
+                    continue;
+                }
+                let (first, last) = (range.at as u16, (range.at + count - 1) as u16);
                 rows.push(MapRow {
                     table,
                     first,
@@ -315,7 +347,7 @@ impl RegisterMap {
                     first_number: traditional_number(table, first),
                     last_number: traditional_number(table, last),
                     first_address: place(table, range, 0).text(addressing),
-                    last_address: place(table, range, range.count - 1).text(addressing),
+                    last_address: place(table, range, count - 1).text(addressing),
                     word_order: (range.group > 1).then_some(if range.high_first {
                         WordOrder::HighFirst
                     } else {
@@ -362,9 +394,9 @@ fn place(table: Table, range: &Range, k: u32) -> Address {
     }
     let byte = range.base + k / range.group * range.group * 2;
     let width = match range.group {
-        1 if byte % 2 == 0 => Width::Word,
-        2 if byte % 4 == 0 => Width::Double,
-        4 if byte % 8 == 0 => Width::Long,
+        1 if byte.is_multiple_of(2) => Width::Word,
+        2 if byte.is_multiple_of(4) => Width::Double,
+        4 if byte.is_multiple_of(8) => Width::Long,
         _ => Width::Byte,
     };
     Address { area: range.area, width, byte, bit: 0 }

@@ -28,7 +28,8 @@ pub enum Table {
 
 impl Table {
     /// All four.
-    pub const ALL: [Self; 4] = [Self::Coils, Self::DiscreteInputs, Self::InputRegisters, Self::HoldingRegisters];
+    pub const ALL: [Self; 4] =
+        [Self::Coils, Self::DiscreteInputs, Self::InputRegisters, Self::HoldingRegisters];
 
     /// Whether its entries are single bits.
     pub fn is_bits(self) -> bool {
@@ -88,7 +89,13 @@ pub trait Image {
     fn ready(&self, access: Access) -> Result<(), Exception>;
 
     /// Packs `quantity` bits into `out` (ceil(quantity / 8) bytes), low bit first, unused bits zero.
-    fn read_bits(&mut self, table: Table, address: u16, quantity: u16, out: &mut [u8]) -> Result<(), Exception>;
+    fn read_bits(
+        &mut self,
+        table: Table,
+        address: u16,
+        quantity: u16,
+        out: &mut [u8],
+    ) -> Result<(), Exception>;
 
     /// Puts words into `out`, two bytes each, high byte first.
     fn read_words(&mut self, table: Table, address: u16, out: &mut [u8]) -> Result<(), Exception>;
@@ -120,7 +127,12 @@ pub fn answer(request: &[u8], image: &mut dyn Image, out: &mut [u8; MAX_PDU]) ->
     let refused = match decode_request(request) {
         Ok(request) => match execute(&request, image, out) {
             Ok(len) => {
-                return Outcome { len, function: request.function(), exception: None, wrote: writes(&request) };
+                return Outcome {
+                    len,
+                    function: request.function(),
+                    exception: None,
+                    wrote: writes(&request),
+                };
             }
             Err(exception) => (request.function(), exception),
         },
@@ -146,13 +158,24 @@ fn writes(request: &Request<'_>) -> bool {
     )
 }
 
-fn execute(request: &Request<'_>, image: &mut dyn Image, out: &mut [u8; MAX_PDU]) -> Result<usize, Exception> {
+fn execute(
+    request: &Request<'_>,
+    image: &mut dyn Image,
+    out: &mut [u8; MAX_PDU],
+) -> Result<usize, Exception> {
     let response = match *request {
         Request::ReadCoils { address, quantity } => {
             return read_bits(function::READ_COILS, Table::Coils, address, quantity, image, out);
         }
         Request::ReadDiscreteInputs { address, quantity } => {
-            return read_bits(function::READ_DISCRETE_INPUTS, Table::DiscreteInputs, address, quantity, image, out);
+            return read_bits(
+                function::READ_DISCRETE_INPUTS,
+                Table::DiscreteInputs,
+                address,
+                quantity,
+                image,
+                out,
+            );
         }
         Request::ReadHoldingRegisters { address, quantity } => {
             check_read(Table::HoldingRegisters, address, quantity, image)?;
@@ -177,12 +200,24 @@ fn execute(request: &Request<'_>, image: &mut dyn Image, out: &mut [u8; MAX_PDU]
             );
         }
         Request::WriteSingleCoil { address, on } => {
-            write(Table::Coils, address, 1, &Write::Coils { address, quantity: 1, values: &[u8::from(on)] }, image)?;
+            write(
+                Table::Coils,
+                address,
+                1,
+                &Write::Coils { address, quantity: 1, values: &[u8::from(on)] },
+                image,
+            )?;
             Response::WriteSingleCoil { address, on }
         }
         Request::WriteSingleRegister { address, value } => {
             let values = value.to_be_bytes();
-            write(Table::HoldingRegisters, address, 1, &Write::Registers { address, values: &values }, image)?;
+            write(
+                Table::HoldingRegisters,
+                address,
+                1,
+                &Write::Registers { address, values: &values },
+                image,
+            )?;
             Response::WriteSingleRegister { address, value }
         }
         Request::WriteMultipleCoils { address, quantity, values } => {

@@ -29,7 +29,9 @@ pub enum ParseError {
     #[error("data `{0}` must be pairs of hex digits, at most 64 bytes")]
     Data(String),
     /// The digit after `##` is missing or no hex digit.
-    #[error("after ## one hex digit of CAN FD flags is needed: 0 none, 1 bit rate switch, 2 error state, 3 both")]
+    #[error(
+        "after ## one hex digit of CAN FD flags is needed: 0 none, 1 bit rate switch, 2 error state, 3 both"
+    )]
     FdFlags,
     /// `R` is followed by something other than one digit 0-8.
     #[error("remote frame length `{0}` must be one digit, 0-8")]
@@ -245,7 +247,10 @@ mod tests {
             ("1FFFFFFF#R8", Frame::remote(0x1FFF_FFFF, true, 8)),
             ("123##1AABB", Frame::fd(0x123, false, FD_BRS, &[0xAA, 0xBB])),
             ("123##0", Frame::fd(0x123, false, 0, &[])),
-            ("12345678##3010203040506070809101112", Frame::fd(0x1234_5678, true, FD_BRS | FD_ESI, &[1, 2, 3, 4, 5, 6, 7, 8, 9, 0x10, 0x11, 0x12])),
+            (
+                "12345678##3010203040506070809101112",
+                Frame::fd(0x1234_5678, true, FD_BRS | FD_ESI, &[1, 2, 3, 4, 5, 6, 7, 8, 9, 0x10, 0x11, 0x12]),
+            ),
         ];
         for (text, frame) in table {
             let frame = frame.unwrap();
@@ -262,8 +267,23 @@ mod tests {
     #[test]
     fn mistakes_are_named() {
         let said: Vec<String> = [
-            "123", "12#00", "1234#00", "XYZ#00", "800#00", "40000000#00", "123#0", "123#00.", "123#0G", "123#R9",
-            "123#Rx", "123#001122334455667788", "123##", "123##x", "123##0001122334455667788", "123##8", "123#11_E",
+            "123",
+            "12#00",
+            "1234#00",
+            "XYZ#00",
+            "800#00",
+            "40000000#00",
+            "123#0",
+            "123#00.",
+            "123#0G",
+            "123#R9",
+            "123#Rx",
+            "123#001122334455667788",
+            "123##",
+            "123##x",
+            "123##0001122334455667788",
+            "123##8",
+            "123#11_E",
         ]
         .iter()
         .map(|text| format!("{text}: {}", parse(text).unwrap_err()))
@@ -307,8 +327,14 @@ mod tests {
         assert_eq!(parse_log_line("# made by hand"), Ok(None));
         let long = format!("(1.0) can0 123#{}", "0".repeat(600));
         let said: Vec<String> = [
-            "1 (1612543138.000000) vcan0 18EF000B#00", "(x) can0 123#00", "(1.-5) can0 123#00", "(1.0) can0",
-            "(1.0) can0 123#00 Q", "(99999999999999.0) can0 123#00", "(1.0) can0 123#0", &long,
+            "1 (1612543138.000000) vcan0 18EF000B#00",
+            "(x) can0 123#00",
+            "(1.-5) can0 123#00",
+            "(1.0) can0",
+            "(1.0) can0 123#00 Q",
+            "(99999999999999.0) can0 123#00",
+            "(1.0) can0 123#0",
+            &long,
         ]
         .iter()
         .map(|text| format!("{}", parse_log_line(text).unwrap_err()))
@@ -327,10 +353,11 @@ mod tests {
 
     #[test]
     fn screen_lines() {
-        let said: Vec<String> = ["123#DEADBEEF", "12345678#01", "123#R4", "123##1AABB", "20000004#0004000000000000"]
-            .iter()
-            .map(|text| format_screen(None, "can0", &parse(text).unwrap()))
-            .collect();
+        let said: Vec<String> =
+            ["123#DEADBEEF", "12345678#01", "123#R4", "123##1AABB", "20000004#0004000000000000"]
+                .iter()
+                .map(|text| format_screen(None, "can0", &parse(text).unwrap()))
+                .collect();
         insta::assert_snapshot!(said.join("\n"), @r#"
         can0  123   [4]  DE AD BE EF
         can0  12345678   [1]  01

@@ -215,8 +215,7 @@ pub(crate) mod tests {
                 Frame::fd(id, ext, flags, &data).unwrap()
             },
         );
-        let remote =
-            (any_id(), 0u8..=8).prop_map(|((id, ext), len)| Frame::remote(id, ext, len).unwrap());
+        let remote = (any_id(), 0u8..=8).prop_map(|((id, ext), len)| Frame::remote(id, ext, len).unwrap());
         prop_oneof![any_classic(), remote, fd]
     }
 
@@ -240,7 +239,12 @@ pub(crate) mod tests {
             ext(EFF_MASK),
         ];
         for pair in in_order.windows(2) {
-            assert!(pair[0].arbitration_key() < pair[1].arbitration_key(), "{:?} before {:?}", pair[0], pair[1]);
+            assert!(
+                pair[0].arbitration_key() < pair[1].arbitration_key(),
+                "{:?} before {:?}",
+                pair[0],
+                pair[1]
+            );
         }
     }
 

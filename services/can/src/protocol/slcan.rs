@@ -106,7 +106,9 @@ impl Decoder {
 fn parse(line: &[u8]) -> Command {
     let Some((&letter, rest)) = line.split_first() else { return Command::Empty };
     let command = match letter {
-        b't' | b'T' | b'r' | b'R' | b'd' | b'D' | b'b' | b'B' => transmit(letter, rest).map(Command::Transmit),
+        b't' | b'T' | b'r' | b'R' | b'd' | b'D' | b'b' | b'B' => {
+            transmit(letter, rest).map(Command::Transmit)
+        }
         b'O' if rest.is_empty() => Some(Command::Open { listen_only: false }),
         b'L' if rest.is_empty() => Some(Command::Open { listen_only: true }),
         b'C' if rest.is_empty() => Some(Command::Close),
@@ -215,7 +217,11 @@ impl Session {
                 OK
             }
             Command::Bitrate(_) | Command::BitTiming(_) | Command::DataBitrate(_) => {
-                if self.open { BEL } else { OK }
+                if self.open {
+                    BEL
+                } else {
+                    OK
+                }
             }
             Command::Timestamps(on) => {
                 self.timestamps = on;
@@ -314,12 +320,18 @@ mod tests {
     fn frames_both_ways() {
         let table = [
             ("t1230\r", Frame::data(0x123, false, &[]).unwrap()),
-            ("t7FF81122334455667788\r", Frame::data(0x7FF, false, &[0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0x77, 0x88]).unwrap()),
+            (
+                "t7FF81122334455667788\r",
+                Frame::data(0x7FF, false, &[0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0x77, 0x88]).unwrap(),
+            ),
             ("T000001232ABCD\r", Frame::data(0x123, true, &[0xAB, 0xCD]).unwrap()),
             ("T1FFFFFFF0\r", Frame::data(0x1FFF_FFFF, true, &[]).unwrap()),
             ("r1234\r", Frame::remote(0x123, false, 4).unwrap()),
             ("R123456788\r", Frame::remote(0x1234_5678, true, 8).unwrap()),
-            ("d1239000102030405060708090A0B\r", Frame::fd(0x123, false, 0, &[0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]).unwrap()),
+            (
+                "d1239000102030405060708090A0B\r",
+                Frame::fd(0x123, false, 0, &[0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]).unwrap(),
+            ),
             ("D000001230\r", Frame::fd(0x123, true, 0, &[]).unwrap()),
             ("b0012AABB\r", Frame::fd(1, false, FD_BRS, &[0xAA, 0xBB]).unwrap()),
             ("B1FFFFFFF15A\r", Frame::fd(0x1FFF_FFFF, true, FD_BRS, &[0x5A]).unwrap()),
@@ -330,7 +342,10 @@ mod tests {
         }
         // A stamp after the data is ignored.
         assert_eq!(one(b"t1231AA1F40\r"), Command::Transmit(Frame::data(0x123, false, &[0xAA]).unwrap()));
-        assert_eq!(text(&Frame::data(0x123, false, &[0xAA]).unwrap(), Some(60_000 + 0x1F40)), "t1231AA1F40\r");
+        assert_eq!(
+            text(&Frame::data(0x123, false, &[0xAA]).unwrap(), Some(60_000 + 0x1F40)),
+            "t1231AA1F40\r"
+        );
         let error = Frame { can_id: super::super::frame::ERR_FLAG | 0x40, len: 8, ..Frame::default() };
         assert_eq!(text(&error, None), "");
         // SLCAN has no place for ESI.
@@ -341,8 +356,27 @@ mod tests {
     fn nonsense_is_refused() {
         let overlong = format!("t{}\r", "0".repeat(500));
         for line in [
-            "x\r", "t\r", "t12\r", "t123\r", "t1231\r", "t1231A\r", "t1239\r", "t8000\r", "tXYZ0\r", "T200000000\r",
-            "r1239\r", "S\r", "SA\r", "S10\r", "Z2\r", "OO\r", "d123F00\r", "m0\r", "s1\r", "Yx\r", "t1231GG\r",
+            "x\r",
+            "t\r",
+            "t12\r",
+            "t123\r",
+            "t1231\r",
+            "t1231A\r",
+            "t1239\r",
+            "t8000\r",
+            "tXYZ0\r",
+            "T200000000\r",
+            "r1239\r",
+            "S\r",
+            "SA\r",
+            "S10\r",
+            "Z2\r",
+            "OO\r",
+            "d123F00\r",
+            "m0\r",
+            "s1\r",
+            "Yx\r",
+            "t1231GG\r",
             overlong.as_str(),
         ] {
             assert_eq!(one(line.as_bytes()), Command::Nonsense, "{line:?}");

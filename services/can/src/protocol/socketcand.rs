@@ -65,7 +65,8 @@ impl BusName {
 }
 
 const UNKNOWN: &[u8] = b"< error unknown command >";
-const UNSUPPORTED: &[u8] = b"< error not supported: this server offers open, rawmode, bcmmode, send, sendrtr, echo >";
+const UNSUPPORTED: &[u8] =
+    b"< error not supported: this server offers open, rawmode, bcmmode, send, sendrtr, echo >";
 const OVERLONG: &[u8] = b"< error command longer than 256 characters >";
 const OUTSIDE: &[u8] = b"< error text outside of angle brackets >";
 const BAD_SEND: &[u8] = b"< error send: expected ID LEN and LEN bytes in hex >";
@@ -383,7 +384,9 @@ mod tests {
     fn session_of_python_can() {
         let mut session = Session::default();
         let mut answers = Vec::new();
-        for command in all(b"< rawmode >< send 1 0 >< open can0 >< open can0 >< rawmode >< send 1 0 >< add >< bcmmode >") {
+        for command in
+            all(b"< rawmode >< send 1 0 >< open can0 >< open can0 >< rawmode >< send 1 0 >< add >< bcmmode >")
+        {
             answers.push((session.handle(&command, "can0"), session.receives()));
         }
         let frame = Frame::data(1, false, &[]).unwrap();

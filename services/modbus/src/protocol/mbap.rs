@@ -2,7 +2,7 @@
 //! bytes, cut anywhere, to frames.
 //!
 //! A header with another protocol identifier than 0 is dropped with its frame and nothing is answered (Guide
-//! V1.0b clause 4.4.2.2, MBAP header check). A length of 0, 1 or more than 254 leaves no way to find
+//! V1.0b clause 4.4.2.2, MBAP header check). A length of 0, 1 or more than [`MAX_LENGTH`] leaves no way to find
 //! the next header, so the stream ends there.
 
 use super::pdu::MAX_PDU;
@@ -11,8 +11,12 @@ use super::pdu::MAX_PDU;
 pub const HEADER: usize = 7;
 /// Largest frame: header and PDU (V1.1b3 clause 4.1: 260 bytes).
 pub const MAX_ADU: usize = HEADER + MAX_PDU;
-/// Smallest and largest legal length field: unit id and a PDU of 1 to 253 bytes.
-const LENGTHS: std::ops::RangeInclusive<u16> = 2..=1 + MAX_PDU as u16;
+/// Largest length field that is still believed. Legal are 2 to 254: unit id and a PDU of 1 to 253 bytes. A write
+/// whose one-byte byte count is too large makes a PDU of at most 265 bytes (function 23: 10 bytes and 255
+/// values); such a frame is whole, so its sender gets exception 03 and keeps its connection.
+pub const MAX_LENGTH: u16 = 266;
+/// Most bytes that one received frame takes.
+pub const MAX_RECEIVED: usize = HEADER - 1 + MAX_LENGTH as usize;
 
 /// One frame, its PDU where the caller's bytes have it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -21,7 +25,7 @@ pub struct Frame<'a> {
     pub transaction: u16,
     /// Unit identifier, repeated in the answer.
     pub unit: u8,
-    /// 1 to 253 bytes.
+    /// 1 to 265 bytes; more than 253 are no legal request.
     pub pdu: &'a [u8],
 }
 
@@ -42,7 +46,7 @@ pub enum Scan<'a> {
 pub fn scan(bytes: &[u8]) -> Scan<'_> {
     let &[t1, t0, p1, p0, l1, l0, ref rest @ ..] = bytes else { return Scan::Incomplete };
     let length = u16::from_be_bytes([l1, l0]);
-    if !LENGTHS.contains(&length) {
+    if !(2..=MAX_LENGTH).contains(&length) {
         return Scan::BadLength { length };
     }
     let Some(body) = rest.get(..usize::from(length)) else { return Scan::Incomplete };
@@ -89,10 +93,10 @@ mod tests {
             b.extend(vec![3; 300]);
             b
         };
-        for length in [0, 1, 255, 256, 300, 0xFFFF] {
+        for length in [0, 1, 267, 300, 0xFFFF] {
             assert_eq!(scan(&with_length(length)), Scan::BadLength { length }, "{length}");
         }
-        for length in [2, 3, 254] {
+        for length in [2, 3, 254, 255, 266] {
             let bytes = with_length(length);
             let Scan::Frame { frame, used } = scan(&bytes) else { panic!("{length} is legal") };
             assert_eq!((frame.pdu.len(), used), (usize::from(length) - 1, usize::from(length) + 6));
@@ -116,12 +120,12 @@ mod tests {
         fn any_bytes_give_an_answer_within_them(bytes in proptest::collection::vec(any::<u8>(), 0..600)) {
             match scan(&bytes) {
                 Scan::Frame { frame, used } => {
-                    prop_assert!(used <= bytes.len() && used <= MAX_ADU);
-                    prop_assert!((1..=MAX_PDU).contains(&frame.pdu.len()));
+                    prop_assert!(used <= bytes.len() && used <= MAX_RECEIVED);
+                    prop_assert_eq!(frame.pdu.len() + HEADER, used);
                 }
                 Scan::Foreign { used } => prop_assert!(used >= HEADER && used <= bytes.len()),
-                Scan::Incomplete => prop_assert!(bytes.len() < MAX_ADU),
-                Scan::BadLength { length } => prop_assert!(!(2..=254).contains(&length)),
+                Scan::Incomplete => prop_assert!(bytes.len() < MAX_RECEIVED),
+                Scan::BadLength { length } => prop_assert!(!(2..=266).contains(&length)),
             }
         }
 

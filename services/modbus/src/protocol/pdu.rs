@@ -211,7 +211,7 @@ impl Request<'_> {
 }
 
 fn is_words(values: &[u8], max: u16) -> bool {
-    values.len() % 2 == 0 && (1..=usize::from(max)).contains(&(values.len() / 2))
+    values.len().is_multiple_of(2) && (1..=usize::from(max)).contains(&(values.len() / 2))
 }
 
 /// Bytes that `quantity` packed bits take (V1.1b3 clause 6.1: quantity / 8, one more for a remainder).

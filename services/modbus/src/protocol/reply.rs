@@ -1,8 +1,8 @@
 //! Responses: written by servers, read by clients.
 
 use super::pdu::{
-    COIL_ON, EXCEPTION_BIT, EncodeError, MAX_READ_BITS, MAX_READ_WORDS, MAX_WRITE_BITS, MAX_WRITE_WORDS, Request,
-    bytes_for_bits, function,
+    COIL_ON, EXCEPTION_BIT, EncodeError, MAX_READ_BITS, MAX_READ_WORDS, MAX_WRITE_BITS, MAX_WRITE_WORDS,
+    Request, bytes_for_bits, function,
 };
 use super::wire::{Writer, u16_at};
 
@@ -76,7 +76,8 @@ impl Response<'_> {
             Self::ReadHoldingRegisters(bytes)
             | Self::ReadInputRegisters(bytes)
             | Self::ReadWriteMultipleRegisters(bytes) => {
-                bytes.len() % 2 == 0 && (1..=usize::from(MAX_READ_WORDS)).contains(&(bytes.len() / 2))
+                bytes.len().is_multiple_of(2)
+                    && (1..=usize::from(MAX_READ_WORDS)).contains(&(bytes.len() / 2))
             }
             Self::WriteMultipleCoils { quantity, .. } => (1..=MAX_WRITE_BITS).contains(&quantity),
             Self::WriteMultipleRegisters { quantity, .. } => (1..=MAX_WRITE_WORDS).contains(&quantity),
@@ -141,7 +142,9 @@ pub fn decode_response<'a>(request: &Request<'_>, pdu: &'a [u8]) -> Result<Respo
         return Err(ResponseError::Function { expected: asked, got });
     }
     let response = match *request {
-        Request::ReadCoils { quantity, .. } => Response::ReadCoils(counted(asked, data, bytes_for_bits(quantity))?),
+        Request::ReadCoils { quantity, .. } => {
+            Response::ReadCoils(counted(asked, data, bytes_for_bits(quantity))?)
+        }
         Request::ReadDiscreteInputs { quantity, .. } => {
             Response::ReadDiscreteInputs(counted(asked, data, bytes_for_bits(quantity))?)
         }

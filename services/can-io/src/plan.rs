@@ -1,0 +1,589 @@
+//! From the stack file to tables: every address, identifier and signal resolved, every mistake named.
+
+use ipc_types::wiring::Area;
+
+use crate::address::{self, Address};
+use crate::config::{
+    Config, Id, Input, MAX_INPUTS, MAX_OUTPUTS, MAX_SIGNALS, Mode, OnBadValue, OnBadWord, OnStop, OnStopWord,
+    Output, OutputSignal,
+};
+use crate::protocol::signal::{ByteOrder, Signal};
+use crate::protocol::value::{Codec, IecType, Raw};
+
+/// `can_id` bit of a 29-bit identifier.
+pub const EFF_FLAG: u32 = 0x8000_0000;
+
+/// Something wrong in the service's table.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Mistake {
+    /// Path of the key: `in[2].to`.
+    pub key: String,
+    /// What is wrong.
+    pub message: String,
+    /// What to do about it.
+    pub help: String,
+}
+
+/// An input ready to run.
+#[derive(Debug, Clone)]
+pub struct InputPoint {
+    /// Index of its `[[service.in]]`.
+    pub index: usize,
+    /// Identifier with [`EFF_FLAG`].
+    pub can_id: u32,
+    /// How it is read.
+    pub codec: Codec,
+    /// Where it goes.
+    pub to: Address,
+    /// Byte of %I for the quality.
+    pub status_byte: Option<u32>,
+    /// Older is bad.
+    pub timeout_ns: Option<u64>,
+    /// Value while bad; `None` holds the last one.
+    pub substitute: Option<[u8; 8]>,
+}
+
+/// A signal of a frame sent, ready to run.
+#[derive(Debug, Clone)]
+pub struct OutputPoint {
+    /// How it is written.
+    pub codec: Codec,
+    /// Where it comes from.
+    pub from: Address,
+}
+
+/// What a frame does in the safe state.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Safe {
+    /// Nothing is sent.
+    Silent,
+    /// Cyclic frames go on unchanged.
+    Hold,
+    /// This is sent.
+    Payload([u8; 64]),
+}
+
+/// A frame sent, ready to run.
+#[derive(Debug, Clone)]
+pub struct OutputFrame {
+    /// Index of its `[[service.out]]`.
+    pub index: usize,
+    /// Identifier with [`EFF_FLAG`].
+    pub can_id: u32,
+    /// Bytes.
+    pub len: u8,
+    /// `fd_flags` of the frame: 0, FDF or FDF + BRS.
+    pub fd_flags: u8,
+    /// Cyclic with this period, or on change.
+    pub period_ns: Option<u64>,
+    /// Least time between frames on change.
+    pub inhibit_ns: u64,
+    /// Bytes before signals are written.
+    pub fill: u8,
+    /// Safe state.
+    pub safe: Safe,
+    /// Its signals.
+    pub signals: Vec<OutputPoint>,
+}
+
+/// Everything the service does.
+#[derive(Debug, Clone, Default)]
+pub struct Plan {
+    /// In order of the stack file.
+    pub inputs: Vec<InputPoint>,
+    /// In order of the stack file.
+    pub outputs: Vec<OutputFrame>,
+    /// Empty: the plan can run.
+    pub mistakes: Vec<Mistake>,
+}
+
+struct Mistakes(Vec<Mistake>);
+
+impl Mistakes {
+    fn add(&mut self, key: &str, message: impl Into<String>, help: impl Into<String>) {
+        self.0.push(Mistake { key: key.to_owned(), message: message.into(), help: help.into() });
+    }
+}
+
+/// Resolves the table. Entries with a mistake are left out of the plan.
+pub fn plan(config: &Config) -> Plan {
+    let mut mistakes = Mistakes(Vec::new());
+    for (what, count, limit) in
+        [("in", config.inputs.len(), MAX_INPUTS), ("out", config.outputs.len(), MAX_OUTPUTS)]
+    {
+        if count > limit {
+            let message = format!("{count} entries: a can-io service has at most {limit}");
+            mistakes.add(what, message, "split them over two can-io services");
+        }
+    }
+    let inputs: Vec<_> = config
+        .inputs
+        .iter()
+        .take(MAX_INPUTS)
+        .enumerate()
+        .filter_map(|(index, input)| plan_input(config, index, input, &mut mistakes))
+        .collect();
+    let outputs: Vec<_> = config
+        .outputs
+        .iter()
+        .take(MAX_OUTPUTS)
+        .enumerate()
+        .filter_map(|(index, output)| plan_output(config, index, output, &mut mistakes))
+        .collect();
+    overlaps(&inputs, &mut mistakes);
+    for (i, frame) in outputs.iter().enumerate() {
+        if let Some(other) = outputs[..i].iter().find(|other| other.can_id == frame.can_id) {
+            let message = format!("{} is sent by out[{}] too", id_text(frame.can_id), other.index);
+            mistakes.add(
+                &format!("out[{}].id", frame.index),
+                message,
+                "put all signals of a frame into one entry",
+            );
+        }
+    }
+    Plan { inputs, outputs, mistakes: mistakes.0 }
+}
+
+/// `123h` or `18FEF100h`.
+pub fn id_text(can_id: u32) -> String {
+    if can_id & EFF_FLAG != 0 { format!("{:08X}h", can_id & !EFF_FLAG) } else { format!("{can_id:03X}h") }
+}
+
+fn can_id(id: Id, ext: Option<bool>, key: &str, mistakes: &mut Mistakes) -> Option<u32> {
+    let extended = ext.unwrap_or(id.extended);
+    let limit = if extended { 0x1FFF_FFFF } else { 0x7FF };
+    if id.value > limit {
+        let (bits, help) = if extended {
+            (29, "use at most 1FFFFFFF")
+        } else {
+            (11, "use at most 7FF, or ext = true for 29 bits")
+        };
+        mistakes.add(
+            &format!("{key}.id"),
+            format!("identifier {:X} does not fit in {bits} bits", id.value),
+            help,
+        );
+        return None;
+    }
+    Some(if extended { id.value | EFF_FLAG } else { id.value })
+}
+
+/// The parts that inputs and outputs have in common.
+struct Bits<'a> {
+    start: u32,
+    len: u32,
+    order: ByteOrder,
+    signed: bool,
+    float: bool,
+    scale: f64,
+    offset: f64,
+    address: &'a str,
+    iec: Option<IecType>,
+}
+
+fn codec(
+    config: &Config,
+    bits: &Bits<'_>,
+    areas: &[Area],
+    (key, place): (&str, &str),
+    mistakes: &mut Mistakes,
+) -> Option<(Codec, Address)> {
+    let before = mistakes.0.len();
+    let signal = Signal::new(bits.start, bits.len, bits.order)
+        .map_err(|e| {
+            mistakes.add(&format!("{key}.len"), e.to_string(), "see the DBC numbering of start and len")
+        })
+        .ok();
+    if bits.float && !matches!(bits.len, 32 | 64) {
+        let message = format!("a float signal has 32 or 64 bits, not {}", bits.len);
+        mistakes.add(&format!("{key}.float"), message, "set len = 32 or 64, or float = false");
+    }
+    if bits.scale == 0.0 || !bits.scale.is_finite() || !bits.offset.is_finite() {
+        let message = format!("scale {} and offset {} make no value", bits.scale, bits.offset);
+        mistakes.add(&format!("{key}.scale"), message, "scale must not be 0, and both must be finite");
+    }
+    let place_key = format!("{key}.{place}");
+    let address = match address::parse(bits.address, config.addressing) {
+        Ok(address) if areas.contains(&address.area) => Some(address),
+        Ok(_) if areas == [Area::Input] => {
+            let message = format!("{} is no input: values from the bus go to %I", bits.address);
+            mistakes.add(&place_key, message, "write %I..., and copy it in the program or by a route");
+            None
+        }
+        Ok(_) => {
+            let message = format!("{} is no output: values to the bus come from %Q or %M", bits.address);
+            mistakes.add(&place_key, message, "write %Q... or %M...");
+            None
+        }
+        Err(e) => {
+            mistakes.add(
+                &place_key,
+                e.to_string(),
+                "the plc service's `addressing` says how numbers are counted",
+            );
+            None
+        }
+    }?;
+    let iec = bits.iec.unwrap_or_else(|| default_type(address.bits, bits.signed));
+    if iec.bits() != address.bits {
+        let message =
+            format!("{} has {} bits, {} has {}", bits.address, address.bits, iec.name(), iec.bits());
+        mistakes.add(&format!("{key}.type"), message, "use X for BOOL, B, W, D, L for 8, 16, 32, 64 bits");
+    }
+    let raw = match (bits.float, bits.signed) {
+        (true, _) => Raw::Float,
+        (false, true) => Raw::Signed,
+        (false, false) => Raw::Unsigned,
+    };
+    let codec = Codec { signal: signal?, raw, scale: bits.scale, offset: bits.offset, iec };
+    (mistakes.0.len() == before).then_some((codec, address))
+}
+
+fn default_type(bits: u32, signed: bool) -> IecType {
+    match (bits, signed) {
+        (1, _) => IecType::Bool,
+        (8, false) => IecType::Usint,
+        (8, true) => IecType::Sint,
+        (16, false) => IecType::Uint,
+        (16, true) => IecType::Int,
+        (32, false) => IecType::Udint,
+        (32, true) => IecType::Dint,
+        (_, false) => IecType::Ulint,
+        (_, true) => IecType::Lint,
+    }
+}
+
+fn plan_input(config: &Config, index: usize, input: &Input, mistakes: &mut Mistakes) -> Option<InputPoint> {
+    let key = format!("in[{index}]");
+    let can_id = can_id(input.id, input.ext, &key, mistakes);
+    let bits = Bits {
+        start: input.start,
+        len: input.len,
+        order: input.order,
+        signed: input.signed,
+        float: input.float,
+        scale: input.scale,
+        offset: input.offset,
+        address: &input.to,
+        iec: input.iec,
+    };
+    let resolved = codec(config, &bits, &[Area::Input], (&key, "to"), mistakes);
+    if input.timeout.is_some_and(|t| t.ns() < 1_000_000) {
+        mistakes.add(&format!("{key}.timeout"), "a timeout below 1ms is no timeout", "use at least 1ms");
+    }
+    let status = input.status_to.as_deref().map(|text| {
+        let found = address::parse(text, config.addressing);
+        let byte = found.ok().filter(|a| a.area == Area::Input && a.bits == 8).map(|a| a.byte);
+        if byte.is_none() {
+            let message = format!("'{text}' is no byte of the inputs");
+            mistakes.add(&format!("{key}.status_to"), message, "write %IB and a number, as %IB10");
+        }
+        byte
+    });
+    let (codec, to) = resolved?;
+    let substitute = match input.on_bad {
+        OnBadValue::Word(OnBadWord::Hold) => None,
+        OnBadValue::Word(OnBadWord::Zero) => Some([0; 8]),
+        OnBadValue::Value(value) => Some(codec.substitute(value)),
+    };
+    let timeout_ns = input.timeout.map(|t| t.ns());
+    Some(InputPoint {
+        index,
+        can_id: can_id?,
+        codec,
+        to,
+        status_byte: status.flatten(),
+        timeout_ns,
+        substitute,
+    })
+}
+
+fn plan_output(
+    config: &Config,
+    index: usize,
+    output: &Output,
+    mistakes: &mut Mistakes,
+) -> Option<OutputFrame> {
+    let key = format!("out[{index}]");
+    let before = mistakes.0.len();
+    let can_id = can_id(output.id, output.ext, &key, mistakes);
+    let fd = output.fd.unwrap_or(output.dlc > 8);
+    let possible: &[u32] = if fd {
+        &[0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64]
+    } else {
+        &[0, 1, 2, 3, 4, 5, 6, 7, 8]
+    };
+    if !possible.contains(&output.dlc) {
+        let message =
+            format!("a {} frame has no {} bytes", if fd { "CAN FD" } else { "classic" }, output.dlc);
+        mistakes.add(
+            &format!("{key}.dlc"),
+            message,
+            "use 0 to 8, for CAN FD also 12, 16, 20, 24, 32, 48 or 64",
+        );
+    }
+    if output.brs && !fd {
+        mistakes.add(
+            &format!("{key}.brs"),
+            "only CAN FD switches the bit rate",
+            "set fd = true, or remove brs",
+        );
+    }
+    match (output.mode, output.period.map(|p| p.ns())) {
+        (Mode::Cyclic, Some(1_000_000..)) | (Mode::OnChange, None) => {}
+        (Mode::Cyclic, _) => {
+            mistakes.add(
+                &format!("{key}.period"),
+                "a cyclic frame needs a period of at least 1ms",
+                "add period = \"100ms\"",
+            );
+        }
+        (Mode::OnChange, Some(_)) => {
+            let help = "remove it, or use mode = \"cyclic\"";
+            mistakes.add(&format!("{key}.period"), "a frame sent on change has no period", help);
+        }
+    }
+    if output.mode == Mode::Cyclic && output.inhibit.ns() > 0 {
+        let help = "remove it, or use mode = \"on_change\"";
+        mistakes.add(&format!("{key}.inhibit"), "a cyclic frame has no inhibit time", help);
+    }
+    if output.signals.len() > MAX_SIGNALS {
+        let message = format!("{} signals: a frame has at most {MAX_SIGNALS}", output.signals.len());
+        mistakes.add(&format!("{key}.signals"), message, "send them in two frames");
+    }
+    let mut signals = Vec::new();
+    let mut covered = [0u8; 64];
+    for (i, signal) in output.signals.iter().take(MAX_SIGNALS).enumerate() {
+        let key = format!("{key}.signals[{i}]");
+        let Some(point) = plan_signal(config, signal, &key, mistakes) else { continue };
+        let layout = point.codec.signal;
+        if layout.frame_bytes() > output.dlc as usize {
+            let message =
+                format!("{} needs {} bytes, dlc is {}", layout.label(), layout.frame_bytes(), output.dlc);
+            mistakes.add(&format!("{key}.start"), message, "set dlc higher, or start or len lower");
+            continue;
+        }
+        let mut own = [0u8; 64];
+        layout.insert(&mut own, u64::MAX);
+        if own.iter().zip(&covered).any(|(a, b)| a & b != 0) {
+            let message = format!("{} lies over another signal of the frame", layout.label());
+            mistakes.add(&format!("{key}.start"), message, "give every bit to one signal only");
+        }
+        covered.iter_mut().zip(&own).for_each(|(a, b)| *a |= b);
+        signals.push(point);
+    }
+    let safe = safe_state(output, &signals, &key, mistakes);
+    let frame = OutputFrame {
+        index,
+        can_id: can_id?,
+        len: output.dlc as u8,
+        fd_flags: if fd { 4 | u8::from(output.brs) } else { 0 },
+        period_ns: output.period.map(|p| p.ns()),
+        inhibit_ns: output.inhibit.ns(),
+        fill: output.fill,
+        safe,
+        signals,
+    };
+    (mistakes.0.len() == before).then_some(frame)
+}
+
+fn plan_signal(
+    config: &Config,
+    signal: &OutputSignal,
+    key: &str,
+    mistakes: &mut Mistakes,
+) -> Option<OutputPoint> {
+    let bits = Bits {
+        start: signal.start,
+        len: signal.len,
+        order: signal.order,
+        signed: signal.signed,
+        float: signal.float,
+        scale: signal.scale,
+        offset: signal.offset,
+        address: &signal.from,
+        iec: signal.iec,
+    };
+    let (codec, from) = codec(config, &bits, &[Area::Output, Area::Marker], (key, "from"), mistakes)?;
+    Some(OutputPoint { codec, from })
+}
+
+fn safe_state(output: &Output, signals: &[OutputPoint], key: &str, mistakes: &mut Mistakes) -> Safe {
+    let mut payload = [output.fill; 64];
+    match &output.on_stop {
+        OnStop::Word(OnStopWord::Silent) => Safe::Silent,
+        OnStop::Word(OnStopWord::Hold) => Safe::Hold,
+        OnStop::Word(OnStopWord::NotAvailable) => {
+            for point in signals {
+                point.codec.signal.insert(&mut payload, u64::MAX);
+            }
+            Safe::Payload(payload)
+        }
+        OnStop::Values(stop) => {
+            if stop.values.len() != output.signals.len() || stop.values.iter().any(|v| !v.is_finite()) {
+                let message = format!("{} values for {} signals", stop.values.len(), output.signals.len());
+                mistakes.add(
+                    &format!("{key}.on_stop"),
+                    message,
+                    "give one finite number per signal, in their order",
+                );
+            }
+            for (point, value) in signals.iter().zip(&stop.values) {
+                point.codec.encode_physical(*value, &mut payload);
+            }
+            Safe::Payload(payload)
+        }
+    }
+}
+
+/// Two inputs of this service on one place; the launcher finds those of two services.
+fn overlaps(inputs: &[InputPoint], mistakes: &mut Mistakes) {
+    let span = |point: &InputPoint| {
+        let first = point.to.byte * 8 + u32::from(point.to.bit.unwrap_or(0));
+        (first, first + point.to.bits)
+    };
+    let mut sorted: Vec<&InputPoint> = inputs.iter().collect();
+    sorted.sort_by_key(|point| (span(point), point.index));
+    for pair in sorted.windows(2) {
+        if span(pair[1]).0 < span(pair[0]).1 {
+            let (low, high) = (pair[0].index.min(pair[1].index), pair[0].index.max(pair[1].index));
+            let message = format!("lies over in[{low}].to");
+            mistakes.add(&format!("in[{high}].to"), message, "give every bit of %I to one input only");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn planned(value: serde_json::Value) -> Plan {
+        plan(&serde_json::from_value(value).unwrap())
+    }
+
+    fn said(value: serde_json::Value) -> String {
+        let mistakes = planned(value).mistakes;
+        mistakes
+            .iter()
+            .map(|m| format!("{}: {} -> {}", m.key, m.message, m.help))
+            .collect::<Vec<_>>()
+            .join("\n")
+    }
+
+    #[test]
+    fn a_good_table() {
+        let plan = planned(json!({
+            "in": [
+                { "id": 0x1A0, "start": 0, "len": 16, "to": "%IW0", "type": "UINT", "timeout": "500ms" },
+                { "id": 0x1A0, "start": 23, "len": 12, "order": "motorola", "signed": true, "to": "%IW1",
+                  "on_bad": -1, "status_to": "%IB10" },
+                { "id": "00000001", "start": 0, "len": 1, "to": "%IX4.7", "on_bad": "zero" },
+                { "id": 1, "start": 0, "len": 1, "to": "%IX4.6" },
+            ],
+            "out": [{ "id": 0x210, "dlc": 8, "mode": "cyclic", "period": "100ms", "fill": 255,
+                "on_stop": { "values": [-40, 1] },
+                "signals": [
+                    { "start": 0, "len": 8, "scale": 0.5, "offset": -40.0, "from": "%QW0", "type": "INT" },
+                    { "start": 16, "len": 1, "from": "%MX0.0" } ] }],
+        }));
+        assert_eq!(plan.mistakes, []);
+        assert_eq!(plan.inputs[1].codec.iec, IecType::Int);
+        assert_eq!(
+            plan.inputs[1].substitute,
+            Some((-1i64).to_le_bytes().map(|b| b)).map(|mut b| {
+                b[2..].fill(0xFF);
+                b
+            })
+        );
+        assert_eq!((plan.inputs[1].status_byte, plan.inputs[0].timeout_ns), (Some(10), Some(500_000_000)));
+        assert_eq!((plan.inputs[2].can_id, plan.inputs[3].can_id), (EFF_FLAG | 1, 1));
+        let frame = &plan.outputs[0];
+        assert_eq!(
+            (frame.can_id, frame.len, frame.fd_flags, frame.period_ns),
+            (0x210, 8, 0, Some(100_000_000))
+        );
+        let Safe::Payload(safe) = frame.safe else { panic!("{:?}", frame.safe) };
+        assert_eq!(safe[..8], [0, 255, 255, 255, 255, 255, 255, 255]);
+    }
+
+    #[test]
+    fn mistakes_are_named() {
+        let input = |value: serde_json::Value| {
+            let mut base = json!({ "id": 1, "start": 0, "len": 8, "to": "%IB0" });
+            base.as_object_mut().unwrap().extend(value.as_object().unwrap().clone());
+            said(json!({ "in": [base] }))
+        };
+        let output = |value: serde_json::Value| {
+            let mut base = json!({ "id": 1, "dlc": 8, "mode": "on_change",
+                                   "signals": [{ "start": 0, "len": 8, "from": "%QB0" }] });
+            base.as_object_mut().unwrap().extend(value.as_object().unwrap().clone());
+            said(json!({ "out": [base] }))
+        };
+        let all = [
+            input(json!({ "id": 0x800, "ext": false })),
+            input(json!({ "id": 0x2000_0000 })),
+            input(json!({ "len": 65 })),
+            input(json!({ "start": 511, "len": 2 })),
+            input(json!({ "float": true })),
+            input(json!({ "scale": 0 })),
+            input(json!({ "to": "%QB0" })),
+            input(json!({ "to": "%IX0.8" })),
+            input(json!({ "to": "%IB0", "type": "INT" })),
+            input(json!({ "timeout": "10us", "status_to": "%IW4" })),
+            said(json!({ "in": [
+                { "id": 1, "start": 0, "len": 8, "to": "%IX1.3" },
+                { "id": 1, "start": 0, "len": 8, "to": "%IW0" } ] })),
+            output(json!({ "dlc": 9 })),
+            output(json!({ "dlc": 9, "fd": false, "brs": true })),
+            output(json!({ "mode": "cyclic", "inhibit": "1ms" })),
+            output(json!({ "period": "10ms" })),
+            output(json!({ "dlc": 0 })),
+            output(json!({ "signals": [{ "start": 0, "len": 8, "from": "%IB0" }] })),
+            output(
+                json!({ "signals": [{ "start": 0, "len": 9, "from": "%QW0" }, { "start": 8, "len": 8, "from": "%QB2" }] }),
+            ),
+            output(json!({ "on_stop": { "values": [] } })),
+            said(json!({ "out": [
+                { "id": 5, "dlc": 0, "mode": "on_change" }, { "id": "005", "dlc": 0, "mode": "on_change" } ] })),
+        ];
+        insta::assert_snapshot!(all.join("\n"), @r#"
+        in[0].id: identifier 800 does not fit in 11 bits -> use at most 7FF, or ext = true for 29 bits
+        in[0].id: identifier 20000000 does not fit in 29 bits -> use at most 1FFFFFFF
+        in[0].len: len 65 is not possible: a signal has 1 to 64 bits -> see the DBC numbering of start and len
+        in[0].len: a signal of 2 bits from bit 511 needs 65 bytes: a frame has at most 64 -> see the DBC numbering of start and len
+        in[0].float: a float signal has 32 or 64 bits, not 8 -> set len = 32 or 64, or float = false
+        in[0].scale: scale 0 and offset 0 make no value -> scale must not be 0, and both must be finite
+        in[0].to: %QB0 is no input: values from the bus go to %I -> write %I..., and copy it in the program or by a route
+        in[0].to: '%IX0.8': bits are 0 to 7; you probably mean %IX1.0 -> the plc service's `addressing` says how numbers are counted
+        in[0].type: %IB0 has 8 bits, INT has 16 -> use X for BOOL, B, W, D, L for 8, 16, 32, 64 bits
+        in[0].timeout: a timeout below 1ms is no timeout -> use at least 1ms
+        in[0].status_to: '%IW4' is no byte of the inputs -> write %IB and a number, as %IB10
+        in[1].to: lies over in[0].to -> give every bit of %I to one input only
+        out[0].dlc: a CAN FD frame has no 9 bytes -> use 0 to 8, for CAN FD also 12, 16, 20, 24, 32, 48 or 64
+        out[0].dlc: a classic frame has no 9 bytes -> use 0 to 8, for CAN FD also 12, 16, 20, 24, 32, 48 or 64
+        out[0].brs: only CAN FD switches the bit rate -> set fd = true, or remove brs
+        out[0].period: a cyclic frame needs a period of at least 1ms -> add period = "100ms"
+        out[0].inhibit: a cyclic frame has no inhibit time -> remove it, or use mode = "on_change"
+        out[0].period: a frame sent on change has no period -> remove it, or use mode = "cyclic"
+        out[0].signals[0].start: 8 bits from 0 intel needs 1 bytes, dlc is 0 -> set dlc higher, or start or len lower
+        out[0].signals[0].from: %IB0 is no output: values to the bus come from %Q or %M -> write %Q... or %M...
+        out[0].signals[1].start: 8 bits from 8 intel lies over another signal of the frame -> give every bit to one signal only
+        out[0].on_stop: 0 values for 1 signals -> give one finite number per signal, in their order
+        out[1].id: 005h is sent by out[0] too -> put all signals of a frame into one entry
+        "#);
+    }
+
+    #[test]
+    fn limits() {
+        let inputs: Vec<_> = (0..MAX_INPUTS + 1)
+            .map(|i| json!({ "id": 1, "start": 0, "len": 8, "to": format!("%IB{i}") }))
+            .collect();
+        assert!(
+            said(json!({ "in": inputs })).starts_with("in: 1025 entries: a can-io service has at most 1024")
+        );
+        let signals: Vec<_> = (0..65).map(|i| json!({ "start": i, "len": 1, "from": "%QX0.0" })).collect();
+        let text = said(json!({ "out": [{ "id": 1, "dlc": 64, "mode": "on_change", "signals": signals }] }));
+        assert!(text.starts_with("out[0].signals: 65 signals: a frame has at most 64"), "{text}");
+    }
+}

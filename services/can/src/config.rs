@@ -1,0 +1,377 @@
+//! The service's table of the stack file, and what can be found wrong with it without starting.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use ipc_types::Finding;
+use ipc_types::net::IpFilter;
+use ipc_types::units::{BitRate, Size, Span};
+use serde::{Deserialize, Serialize};
+
+use crate::feed;
+use crate::virtual_bus::{CLIENT_QUEUE, MAX_CLIENTS, Settings};
+
+/// What stands between this driver and the wire.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Backend {
+    /// A bus inside the driver process.
+    Virtual,
+    /// A network interface of the kernel.
+    Socketcan,
+    /// A serial adapter.
+    Slcan,
+    /// A remote socketcand.
+    Socketcand,
+}
+
+/// A service of kind `can`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Required.
+    pub backend: Backend,
+    /// Name of the interface or device; without meaning for `virtual`.
+    #[serde(default)]
+    pub interface: Option<String>,
+    /// Number for blocks that name a bus by number; default: order in the stack file.
+    #[serde(default)]
+    pub number: Option<u32>,
+    /// Nominal bit rate, 5k - 1M. Default 500k.
+    #[serde(default = "default_bitrate")]
+    pub bitrate: BitRate,
+    /// Data bit rate of CAN FD, up to 8M. Default 2M.
+    #[serde(default = "default_data_bitrate")]
+    pub data_bitrate: BitRate,
+    /// Hold frames to the time they take on a wire. Default false: as fast as it goes.
+    #[serde(default)]
+    pub pace: bool,
+    /// Without pace: most frames a second, 100 - 10000000. Default 150000: a reader may sleep 50 ms without loss.
+    #[serde(default = "default_max_rate")]
+    pub max_rate: u32,
+    /// Frames of the stack that wait for the bus, 1 - 4096. Default 512.
+    #[serde(default = "default_tx_queue")]
+    pub tx_queue: u32,
+    /// Bytes that wait for one TCP client, 4KiB - 64MiB. Default 1MiB: about 23,000 frames.
+    #[serde(default = "default_client_buffer")]
+    pub client_buffer: Size,
+    /// Servers for foreign tools. Default: none.
+    #[serde(default)]
+    pub serve: Serve,
+    /// A recorded log that is played onto the bus. Default: none.
+    #[serde(default)]
+    pub feed: Option<Feed>,
+}
+
+/// Servers for foreign tools.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Serve {
+    /// The socketcand protocol.
+    #[serde(default)]
+    pub socketcand: Option<Endpoint>,
+    /// SLCAN over TCP.
+    #[serde(default)]
+    pub slcan: Option<Endpoint>,
+}
+
+/// Where a server listens: `"127.0.0.1:29536"` or a table with filter and limit.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(
+    untagged,
+    expecting = "an address such as \"127.0.0.1:29536\", or a table { address, filter, max_clients }"
+)]
+pub enum Endpoint {
+    /// The address alone.
+    Address(SocketAddr),
+    /// Address, filter and limit.
+    Table(EndpointTable),
+}
+
+/// The long form of [`Endpoint`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EndpointTable {
+    /// Where it listens.
+    pub address: SocketAddr,
+    /// Who may connect; required unless the address is loopback.
+    #[serde(default)]
+    pub filter: Option<IpFilter>,
+    /// Most clients at once, 1 - 32. Default 8.
+    #[serde(default = "default_max_clients")]
+    pub max_clients: u32,
+}
+
+impl Endpoint {
+    /// The long form.
+    pub fn table(&self) -> EndpointTable {
+        match self {
+            Self::Address(address) => {
+                EndpointTable { address: *address, filter: None, max_clients: default_max_clients() }
+            }
+            Self::Table(table) => table.clone(),
+        }
+    }
+}
+
+/// A recorded log that is played onto the bus.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Feed {
+    /// A candump log (`candump -L`), relative to the stack file.
+    pub file: PathBuf,
+    /// Take only lines of this bus name. Default: all lines.
+    #[serde(default)]
+    pub bus: Option<String>,
+    /// Start again at the end. Default true.
+    #[serde(default = "default_true", rename = "loop")]
+    pub repeat: bool,
+    /// Pause before it starts again, at least 1ms. Default 100ms.
+    #[serde(default = "default_gap")]
+    pub gap: Span,
+    /// 2.0 plays twice as fast; 0.01 - 1000. Default 1.0.
+    #[serde(default = "default_speed")]
+    pub speed: f64,
+}
+
+fn default_bitrate() -> BitRate {
+    BitRate(500_000)
+}
+fn default_data_bitrate() -> BitRate {
+    BitRate(2_000_000)
+}
+fn default_max_rate() -> u32 {
+    150_000
+}
+fn default_tx_queue() -> u32 {
+    512
+}
+fn default_client_buffer() -> Size {
+    Size(1 << 20)
+}
+fn default_max_clients() -> u32 {
+    8
+}
+fn default_gap() -> Span {
+    Span::from_ms(100)
+}
+fn default_true() -> bool {
+    true
+}
+fn default_speed() -> f64 {
+    1.0
+}
+
+impl Config {
+    /// Servers with their names, as `take_fd` and findings name them.
+    pub fn endpoints(&self) -> Vec<(&'static str, EndpointTable)> {
+        let named = [("socketcand", &self.serve.socketcand), ("slcan", &self.serve.slcan)];
+        named.into_iter().filter_map(|(name, e)| Some((name, e.as_ref()?.table()))).collect()
+    }
+
+    /// How the virtual bus shall behave.
+    pub fn settings(&self, name: &str) -> Settings {
+        Settings {
+            name: name.to_owned(),
+            bitrate: self.bitrate.0,
+            data_bitrate: self.data_bitrate.0,
+            pace: self.pace,
+            max_rate: self.max_rate,
+            tx_queue: self.tx_queue.clamp(1, 4096) as usize,
+            client_buffer: self.client_buffer.0.clamp(4096, 64 << 20) as usize,
+        }
+    }
+
+    /// Every mistake in the table itself; `dir` is the folder of the stack file.
+    pub fn findings(&self, service: &str, dir: &std::path::Path) -> Vec<Finding> {
+        let mut found = Vec::new();
+        let mut error = |key: &str, message: String, help: &str| {
+            found.push(Finding::error(service, key, message, help));
+        };
+        match self.backend {
+            Backend::Virtual => {}
+            Backend::Socketcan => error(
+                "backend",
+                "backend \"socketcan\" is not supported yet".into(),
+                "use backend = \"virtual\"; real interfaces come with a later version",
+            ),
+            Backend::Slcan => error(
+                "backend",
+                "backend \"slcan\" is not supported yet".into(),
+                "use backend = \"virtual\"; serial adapters come with a later version",
+            ),
+            Backend::Socketcand => error(
+                "backend",
+                "backend \"socketcand\" is not supported yet".into(),
+                "use backend = \"virtual\" with serve = { socketcand = ... }; the client comes with a later version",
+            ),
+        }
+        if !(5_000..=1_000_000).contains(&self.bitrate.0) {
+            error("bitrate", format!("bitrate {} is not possible on CAN", self.bitrate), "use 5k to 1M");
+        }
+        if !(5_000..=8_000_000).contains(&self.data_bitrate.0) || self.data_bitrate < self.bitrate {
+            error(
+                "data_bitrate",
+                format!("data_bitrate {} is not possible with bitrate {}", self.data_bitrate, self.bitrate),
+                "use a rate from bitrate up to 8M",
+            );
+        }
+        if !(100..=10_000_000).contains(&self.max_rate) {
+            error(
+                "max_rate",
+                format!("max_rate {} is out of range", self.max_rate),
+                "use 100 to 10000000 frames/s",
+            );
+        }
+        if !(1..=4096).contains(&self.tx_queue) {
+            error("tx_queue", format!("tx_queue {} is out of range", self.tx_queue), "use 1 to 4096");
+        }
+        if !(4096..=64 << 20).contains(&self.client_buffer.0) {
+            let message = format!("client_buffer {} is out of range", self.client_buffer);
+            error("client_buffer", message, "use 4KiB to 64MiB");
+        }
+        if self.backend == Backend::Virtual && self.interface.is_some() {
+            found.push(Finding::warning(
+                service,
+                "interface",
+                "a virtual bus has no interface",
+                "remove the key; clients open the bus by the service's name",
+            ));
+        }
+        self.endpoint_findings(service, &mut found);
+        self.feed_findings(service, dir, &mut found);
+        found
+    }
+
+    fn endpoint_findings(&self, service: &str, found: &mut Vec<Finding>) {
+        let mut total = 0;
+        for (name, endpoint) in self.endpoints() {
+            let key = format!("serve.{name}");
+            total += endpoint.max_clients;
+            if !(1..=MAX_CLIENTS as u32).contains(&endpoint.max_clients) {
+                let message = format!("max_clients {} is out of range", endpoint.max_clients);
+                found.push(Finding::error(service, &key, message, format!("use 1 to {MAX_CLIENTS}")));
+            }
+            match &endpoint.filter {
+                Some(filter) => {
+                    if let Some(fault) = filter.fault() {
+                        found.push(Finding::error(service, &key, fault, "swap start and end"));
+                    }
+                }
+                None if !endpoint.address.ip().is_loopback() => found.push(Finding::error(
+                    service,
+                    &key,
+                    format!("{} is open to the network: anyone could send CAN frames", endpoint.address),
+                    "add filter = { mask = \"255.255.255.0\", start = \"...\", end = \"...\" }, or listen on 127.0.0.1",
+                )),
+                None => {}
+            }
+        }
+        if total > MAX_CLIENTS as u32 {
+            found.push(Finding::error(
+                service,
+                "serve",
+                format!("max_clients of all servers together is {total}"),
+                format!("one bus has at most {MAX_CLIENTS} clients: lower max_clients"),
+            ));
+        }
+    }
+
+    fn feed_findings(&self, service: &str, dir: &std::path::Path, found: &mut Vec<Finding>) {
+        let Some(feed) = &self.feed else { return };
+        if !(0.01..=1000.0).contains(&feed.speed) {
+            let message = format!("speed {} is out of range", feed.speed);
+            found.push(Finding::error(service, "feed.speed", message, "use 0.01 to 1000"));
+        }
+        if feed.gap.ns() < 1_000_000 {
+            let message = format!("gap {} is too short", feed.gap);
+            found.push(Finding::error(service, "feed.gap", message, "use at least 1ms"));
+        }
+        match feed::Log::load(&dir.join(&feed.file), feed.bus.as_deref()) {
+            Ok(_) => {}
+            Err(e) => {
+                let help = format!(
+                    "`file` is a candump log (`candump -L`) of at most {} frames; `bus` picks the lines of one bus",
+                    feed::MAX_FRAMES
+                );
+                found.push(Finding::error(service, "feed.file", e.to_string(), help));
+            }
+        }
+    }
+}
+
+const _: () = assert!(CLIENT_QUEUE <= 4096 && MAX_CLIENTS <= 32);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn config(value: serde_json::Value) -> Config {
+        serde_json::from_value(value).unwrap()
+    }
+
+    fn said(value: serde_json::Value) -> String {
+        let findings = config(value).findings("can0", std::path::Path::new("/nonexistent"));
+        let lines =
+            findings.iter().map(|f| format!("{:?} {}: {} -> {}", f.severity, f.key, f.message, f.help));
+        lines.collect::<Vec<_>>().join("\n")
+    }
+
+    #[test]
+    fn defaults() {
+        let config = config(json!({ "backend": "virtual", "serve": { "socketcand": "127.0.0.1:29536" } }));
+        assert_eq!((config.bitrate.0, config.data_bitrate.0, config.pace), (500_000, 2_000_000, false));
+        assert_eq!((config.tx_queue, config.client_buffer.0), (512, 1 << 20));
+        let (name, endpoint) = config.endpoints().remove(0);
+        assert_eq!((name, endpoint.max_clients, endpoint.filter), ("socketcand", 8, None));
+        assert!(config.findings("can0", std::path::Path::new("/")).is_empty());
+    }
+
+    #[test]
+    fn unknown_keys_are_refused() {
+        for value in [
+            json!({ "backend": "virtual", "bitrat": "500k" }),
+            json!({ "backend": "virtual", "serve": { "socketcan": "127.0.0.1:1" } }),
+            json!({ "backend": "virtual", "feed": { "file": "x", "sped": 1 } }),
+            json!({ "backend": "pcan" }),
+            json!({}),
+        ] {
+            assert!(serde_json::from_value::<Config>(value.clone()).is_err(), "{value}");
+        }
+    }
+
+    #[test]
+    fn mistakes() {
+        let all = [
+            said(json!({ "backend": "socketcan", "interface": "can0" })),
+            said(json!({ "backend": "slcan" })),
+            said(json!({ "backend": "socketcand" })),
+            said(
+                json!({ "backend": "virtual", "interface": "can0", "bitrate": "2M", "max_rate": 5, "tx_queue": 0, "client_buffer": "1KiB" }),
+            ),
+            said(json!({ "backend": "virtual", "serve": {
+                "socketcand": "0.0.0.0:29536",
+                "slcan": { "address": "0.0.0.0:29537", "max_clients": 33,
+                           "filter": { "mask": "255.255.255.0", "start": "10.0.0.9", "end": "10.0.0.1" } } } })),
+            said(json!({ "backend": "virtual", "feed": { "file": "no.log", "speed": 0, "gap": "1us" } })),
+        ];
+        insta::assert_snapshot!(all.join("\n"), @r#"
+        Error backend: backend "socketcan" is not supported yet -> use backend = "virtual"; real interfaces come with a later version
+        Error backend: backend "slcan" is not supported yet -> use backend = "virtual"; serial adapters come with a later version
+        Error backend: backend "socketcand" is not supported yet -> use backend = "virtual" with serve = { socketcand = ... }; the client comes with a later version
+        Error bitrate: bitrate 2M is not possible on CAN -> use 5k to 1M
+        Error max_rate: max_rate 5 is out of range -> use 100 to 10000000 frames/s
+        Error tx_queue: tx_queue 0 is out of range -> use 1 to 4096
+        Error client_buffer: client_buffer 1KiB is out of range -> use 4KiB to 64MiB
+        Warning interface: a virtual bus has no interface -> remove the key; clients open the bus by the service's name
+        Error serve.socketcand: 0.0.0.0:29536 is open to the network: anyone could send CAN frames -> add filter = { mask = "255.255.255.0", start = "...", end = "..." }, or listen on 127.0.0.1
+        Error serve.slcan: max_clients 33 is out of range -> use 1 to 32
+        Error serve.slcan: filter: start 10.0.0.9 lies behind end 10.0.0.1: nobody could connect -> swap start and end
+        Error serve: max_clients of all servers together is 41 -> one bus has at most 32 clients: lower max_clients
+        Error feed.speed: speed 0 is out of range -> use 0.01 to 1000
+        Error feed.gap: gap 1us is too short -> use at least 1ms
+        Error feed.file: feed: cannot read /nonexistent/no.log: No such file or directory (os error 2) -> `file` is a candump log (`candump -L`) of at most 1000000 frames; `bus` picks the lines of one bus
+        "#);
+    }
+}

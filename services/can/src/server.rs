@@ -1,0 +1,349 @@
+//! The virtual bus with its TCP clients, on a current-thread runtime.
+//!
+//! One [`Hub`] holds the bus, the feed and the [`Host`] (the rail, or whatever else wants the frames). Every change
+//! goes through [`Hub::turn`], which is never interrupted: so there is one true order without a lock. A connection
+//! is one task: it reads, gives bytes to the bus, writes what the bus has for it. It stops reading when its queue
+//! on the bus is full, so what a client sends is never dropped.
+
+use std::cell::RefCell;
+use std::io::{self, ErrorKind};
+use std::net::{IpAddr, SocketAddr};
+use std::os::fd::OwnedFd;
+use std::rc::Rc;
+use std::time::Duration;
+
+use ipc_types::net::IpFilter;
+use rustix::time::{Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec};
+use serde::Serialize;
+use tokio::io::Interest;
+use tokio::io::unix::AsyncFd;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Notify;
+
+use crate::feed::Player;
+use crate::virtual_bus::{ClientCounters, Dialect, MAX_CLIENTS, Settings, Stopped, Tap, VirtualBus};
+use crate::watch;
+
+/// Bytes read from a client at once: about 600 socketcand frames.
+const READ_BYTES: usize = 16 * 1024;
+/// How long the last words to a client may take to leave.
+const FAREWELL: Duration = Duration::from_secs(1);
+
+/// Who else is told the frames, and what a client did.
+pub trait Host: Tap {
+    /// A batch of frames is complete: wake the readers.
+    fn flush(&mut self);
+    /// A client came, left or was refused.
+    fn client(&mut self, message: String, refused: bool);
+}
+
+/// A connected client, for the status.
+#[derive(Debug, Clone, Serialize)]
+pub struct ClientStatus {
+    /// Its address.
+    pub peer: SocketAddr,
+    /// What it speaks.
+    pub protocol: Dialect,
+    /// Its counters.
+    #[serde(flatten)]
+    pub counters: ClientCounters,
+}
+
+struct Inner<H> {
+    bus: VirtualBus,
+    host: H,
+    feed: Option<Player>,
+    peers: [Option<(SocketAddr, Dialect)>; MAX_CLIENTS],
+    refused: u64,
+    alarm_ns: Option<u64>,
+}
+
+/// See the module.
+pub struct Hub<H: Host> {
+    inner: RefCell<Inner<H>>,
+    notify: [Notify; MAX_CLIENTS],
+    alarm: AsyncFd<OwnedFd>,
+}
+
+impl<H: Host + 'static> Hub<H> {
+    /// A hub with an idle bus. Needs a tokio runtime.
+    pub fn new(settings: Settings, host: H, feed: Option<Player>) -> io::Result<Rc<Self>> {
+        let timer = rustix::time::timerfd_create(
+            TimerfdClockId::Monotonic,
+            TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC,
+        )?;
+        Ok(Rc::new(Self {
+            inner: RefCell::new(Inner {
+                bus: VirtualBus::new(settings),
+                host,
+                feed,
+                peers: [None; MAX_CLIENTS],
+                refused: 0,
+                alarm_ns: None,
+            }),
+            notify: std::array::from_fn(|_| Notify::new()),
+            alarm: watch::readable(timer)?,
+        }))
+    }
+
+    /// Does something with the bus, then lets it run, wakes everyone with news and sets the clock.
+    pub fn turn<R>(&self, f: impl FnOnce(&mut VirtualBus, &mut H, u64) -> R) -> R {
+        let mut inner = self.inner.borrow_mut();
+        let inner = &mut *inner;
+        let now_ns = ipc_types::clock::mono_ns();
+        let before = inner.bus.counters().frames;
+        let result = f(&mut inner.bus, &mut inner.host, now_ns);
+        let bus = &mut inner.bus;
+        let feed_ns = inner.feed.as_mut().and_then(|p| p.play(now_ns, |frame| bus.push_feed(frame, now_ns)));
+        let bus_ns = bus.run(now_ns, &mut inner.host);
+        if bus.counters().frames != before {
+            inner.host.flush();
+        }
+        let mut wake = bus.take_output_ready() | bus.take_room_again();
+        while wake != 0 {
+            self.notify[wake.trailing_zeros() as usize].notify_one();
+            wake &= wake - 1;
+        }
+        let next_ns = feed_ns.into_iter().chain(bus_ns).min();
+        if next_ns != inner.alarm_ns {
+            inner.alarm_ns = next_ns;
+            self.set_alarm(next_ns);
+        }
+        result
+    }
+
+    fn set_alarm(&self, at_ns: Option<u64>) {
+        // Zero stops the clock; a time in the past rings at once.
+        let ns = at_ns.map_or(0, |ns| ns.max(1));
+        let at = Timespec { tv_sec: (ns / 1_000_000_000) as i64, tv_nsec: (ns % 1_000_000_000) as i64 };
+        let once = Itimerspec { it_interval: Timespec { tv_sec: 0, tv_nsec: 0 }, it_value: at };
+        if let Err(e) = rustix::time::timerfd_settime(self.alarm.get_ref(), TimerfdTimerFlags::ABSTIME, &once)
+        {
+            tracing::error!("setting the clock of the bus: {e}");
+        }
+    }
+
+    /// Waits until the bus wants its next [`Self::turn`] (paced frames, feed).
+    pub async fn alarm(&self) -> io::Result<()> {
+        loop {
+            let mut guard = self.alarm.readable().await?;
+            let mut ticks = [0u8; 8];
+            match rustix::io::read(self.alarm.get_ref(), &mut ticks) {
+                Ok(_) => {
+                    self.inner.borrow_mut().alarm_ns = None;
+                    return Ok(());
+                }
+                Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => guard.clear_ready(),
+                Err(e) => return Err(e.into()),
+            }
+        }
+    }
+
+    /// Looks at bus and host without letting the bus run.
+    pub fn look<R>(&self, f: impl FnOnce(&mut VirtualBus, &mut H) -> R) -> R {
+        let mut inner = self.inner.borrow_mut();
+        let inner = &mut *inner;
+        f(&mut inner.bus, &mut inner.host)
+    }
+
+    /// The connected clients.
+    pub fn clients(&self) -> Vec<ClientStatus> {
+        let inner = self.inner.borrow();
+        let known = inner.peers.iter().enumerate();
+        known
+            .filter_map(|(number, peer)| {
+                let (peer, protocol) = (*peer)?;
+                Some(ClientStatus { peer, protocol, counters: inner.bus.client_counters(number)? })
+            })
+            .collect()
+    }
+
+    /// Connections refused since start.
+    pub fn refused(&self) -> u64 {
+        self.inner.borrow().refused
+    }
+
+    /// Times the feed was played to its end.
+    pub fn feed_rounds(&self) -> Option<u64> {
+        self.inner.borrow().feed.as_ref().map(Player::rounds)
+    }
+
+    /// Accepts clients for ever. Must run inside a `LocalSet`.
+    pub async fn serve(
+        self: Rc<Self>,
+        listener: TcpListener,
+        dialect: Dialect,
+        filter: Option<IpFilter>,
+        max_clients: usize,
+    ) {
+        loop {
+            match listener.accept().await {
+                Ok((stream, peer)) => match self.admit(peer, dialect, filter.as_ref(), max_clients) {
+                    Ok(number) => {
+                        let hub = self.clone();
+                        tokio::task::spawn_local(
+                            async move { hub.talk(stream, number, peer, dialect).await },
+                        );
+                    }
+                    Err(why) => {
+                        let mut inner = self.inner.borrow_mut();
+                        inner.refused += 1;
+                        inner.host.client(format!("{peer} was refused: {why}"), true);
+                    }
+                },
+                // Descriptors exhausted or the like: others must go first.
+                Err(e) => {
+                    tracing::warn!("accepting {dialect:?} clients: {e}");
+                    tokio::time::sleep(Duration::from_millis(100)).await;
+                }
+            }
+        }
+    }
+
+    fn admit(
+        &self,
+        peer: SocketAddr,
+        dialect: Dialect,
+        filter: Option<&IpFilter>,
+        max_clients: usize,
+    ) -> Result<usize, &'static str> {
+        if !filter.map_or_else(|| peer.ip().to_canonical().is_loopback(), |f| f.allows(peer.ip())) {
+            return Err("its address is outside of the filter");
+        }
+        let mut inner = self.inner.borrow_mut();
+        let present = inner.peers.iter().flatten().filter(|(_, d)| *d == dialect).count();
+        if present >= max_clients {
+            return Err("max_clients are connected");
+        }
+        let number = inner.bus.connect(dialect).ok_or("the bus has no room for another client")?;
+        inner.peers[number] = Some((peer, dialect));
+        inner.host.client(format!("{peer} connected ({})", name(dialect)), false);
+        Ok(number)
+    }
+
+    async fn talk(self: Rc<Self>, stream: TcpStream, number: usize, peer: SocketAddr, dialect: Dialect) {
+        let end = match prepare(&stream) {
+            Ok(()) => self.converse(&stream, number).await,
+            Err(e) => Err(e),
+        };
+        let mut inner = self.inner.borrow_mut();
+        let counters = inner.bus.disconnect(number);
+        inner.peers[number] = None;
+        let how = end.err().map(|e| format!(" ({e})")).unwrap_or_default();
+        let message = format!(
+            "{peer} left ({}){how}: {} frames sent, {} received, {} dropped because it did not read, {} commands refused",
+            name(dialect),
+            counters.sent,
+            counters.received,
+            counters.dropped,
+            counters.refused
+        );
+        inner.host.client(message, false);
+    }
+
+    async fn converse(&self, stream: &TcpStream, number: usize) -> io::Result<()> {
+        let mut buffer = vec![0u8; READ_BYTES].into_boxed_slice();
+        let (mut start, mut end) = (0, 0);
+        let mut finished = false;
+        loop {
+            let mut stopped = None;
+            if start < end {
+                let taken =
+                    self.turn(|bus, host, now_ns| bus.take(number, &buffer[start..end], now_ns, host));
+                start += taken.used;
+                stopped = taken.stopped;
+            }
+            let blocked = self.write_out(stream, number)?;
+            match stopped {
+                Some(Stopped::Turn) => {
+                    tokio::task::yield_now().await;
+                    continue;
+                }
+                Some(Stopped::WriteFirst) if !blocked => continue,
+                Some(Stopped::Close) => return self.farewell(stream, number).await,
+                None if finished => return self.farewell(stream, number).await,
+                _ => {}
+            }
+            let wants_read = start == end && !finished;
+            let interest = match (wants_read, blocked) {
+                (true, true) => Some(Interest::READABLE | Interest::WRITABLE),
+                (true, false) => Some(Interest::READABLE),
+                (false, true) => Some(Interest::WRITABLE),
+                (false, false) => None,
+            };
+            let hold_ns = self.inner.borrow().bus.held_until(number);
+            tokio::select! {
+                ready = stream.ready(interest.unwrap_or(Interest::READABLE)), if interest.is_some() => {
+                    if wants_read && ready?.is_readable() {
+                        match stream.try_read(&mut buffer) {
+                            Ok(0) => finished = true,
+                            Ok(n) => (start, end) = (0, n),
+                            Err(e) if e.kind() == ErrorKind::WouldBlock => {}
+                            Err(e) => return Err(e),
+                        }
+                    }
+                }
+                () = self.notify[number].notified() => {}
+                () = sleep_until(hold_ns), if hold_ns.is_some() => {}
+            }
+        }
+    }
+
+    /// Writes what the bus has for the client; true when its socket takes no more now.
+    fn write_out(&self, stream: &TcpStream, number: usize) -> io::Result<bool> {
+        let mut inner = self.inner.borrow_mut();
+        let now_ns = ipc_types::clock::mono_ns();
+        loop {
+            let bytes = inner.bus.output(number, now_ns);
+            if bytes.is_empty() {
+                return Ok(false);
+            }
+            match stream.try_write(bytes) {
+                Ok(0) => return Err(ErrorKind::WriteZero.into()),
+                Ok(n) => inner.bus.written(number, n),
+                Err(e) if e.kind() == ErrorKind::WouldBlock => return Ok(true),
+                Err(e) => return Err(e),
+            }
+        }
+    }
+
+    /// Gives the last words a moment to leave.
+    async fn farewell(&self, stream: &TcpStream, number: usize) -> io::Result<()> {
+        let words = async {
+            while self.write_out(stream, number)? {
+                stream.writable().await?;
+            }
+            Ok(())
+        };
+        tokio::time::timeout(FAREWELL, words).await.unwrap_or(Ok(()))
+    }
+}
+
+fn name(dialect: Dialect) -> &'static str {
+    match dialect {
+        Dialect::Socketcand => "socketcand",
+        Dialect::Slcan => "slcan",
+    }
+}
+
+/// Latency before packing; and a peer that vanished without a word frees its place within a minute.
+fn prepare(stream: &TcpStream) -> io::Result<()> {
+    use rustix::net::sockopt;
+    stream.set_nodelay(true)?;
+    sockopt::set_socket_keepalive(stream, true)?;
+    sockopt::set_tcp_keepidle(stream, Duration::from_secs(30))?;
+    sockopt::set_tcp_keepintvl(stream, Duration::from_secs(10))?;
+    sockopt::set_tcp_keepcnt(stream, 3)?;
+    Ok(())
+}
+
+async fn sleep_until(at_ns: Option<u64>) {
+    let now_ns = ipc_types::clock::mono_ns();
+    let wait_ns = at_ns.map_or(0, |at_ns| at_ns.saturating_sub(now_ns));
+    tokio::time::sleep(Duration::from_nanos(wait_ns)).await;
+}
+
+/// A listener on `address` that this process opens itself (tests and examples; services inherit theirs).
+pub async fn listen(ip: IpAddr, port: u16) -> io::Result<TcpListener> {
+    TcpListener::bind((ip, port)).await
+}

@@ -1,0 +1,317 @@
+//! The process: rail ports, TCP listeners, the loop.
+
+use std::os::fd::OwnedFd;
+use std::rc::Rc;
+use std::time::Duration;
+
+use ipc_types::event::{EventKind, Level};
+use ipc_types::inbox::Inbox;
+use ipc_types::payload::{CanFrame, can_flag};
+use ipc_types::port::{Publisher, Subscriber};
+use ipc_types::rail::RailError;
+use ipc_types::stack::ServiceEntry;
+use ipc_types::topic::TopicKind;
+use ipc_types::wiring::{Listener, Neighbours, TopicDecl};
+use ipc_types::{Context, Finding, Stack, Wiring, clock};
+use serde::Serialize;
+use thiserror::Error;
+use tokio::io::unix::AsyncFd;
+use tokio::net::TcpListener;
+
+use crate::config::{Backend, Config};
+use crate::feed::{FeedError, Log, Player};
+use crate::protocol::Frame;
+use crate::server::{ClientStatus, Host, Hub};
+use crate::txqueue::{Pushed, TxCounters};
+use crate::virtual_bus::{BusCounters, Dialect, Origin, Tap, VirtualBus};
+use crate::watch;
+
+/// Depth of `rx` for a virtual bus: it is faster than any wire, so its bursts are longer.
+const RX_DEPTH: u32 = 8192;
+/// Frames of the rail taken in one turn.
+const TAKE_FRAMES: usize = 256;
+/// Heartbeat; the launcher wants one every 100 ms.
+const BEAT: Duration = Duration::from_millis(50);
+/// Beats from one status to the next: one second.
+const STATUS_BEATS: u32 = 20;
+/// Client events a second that go to the rail; a client that reconnects in a loop must not fill the recording.
+const CLIENT_EVENTS: u32 = 20;
+
+/// Why the driver ended.
+#[derive(Debug, Error)]
+pub enum RunError {
+    /// The rail.
+    #[error(transparent)]
+    Rail(#[from] RailError),
+    /// The log of the feed.
+    #[error(transparent)]
+    Feed(#[from] FeedError),
+    /// The system.
+    #[error("can: {what}: {source}")]
+    System {
+        /// What was attempted.
+        what: &'static str,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// A backend that this version has not.
+    #[error("can: backend {0:?} is not supported yet: use backend = \"virtual\"")]
+    Backend(Backend),
+}
+
+fn system(what: &'static str) -> impl FnOnce(std::io::Error) -> RunError {
+    move |source| RunError::System { what, source }
+}
+
+/// What the driver needs of the launcher.
+pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
+    let mut wiring = Wiring::default();
+    wiring.topics.push(TopicDecl::new(TopicKind::CanRx).depth(RX_DEPTH));
+    wiring.own(TopicKind::CanTx);
+    wiring.read(TopicKind::CanTx.of(&neighbours.name), true, "");
+    for (name, endpoint) in config.endpoints() {
+        wiring.listeners.push(Listener {
+            name: name.to_owned(),
+            address: endpoint.address,
+            key: format!("serve.{name}"),
+        });
+    }
+    if let Some(feed) = &config.feed {
+        wiring.files.push((feed.file.clone(), "feed.file".to_owned()));
+    }
+    wiring
+}
+
+/// Every mistake that can be found without starting.
+pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> {
+    config.findings(&me.name, &stack.dir)
+}
+
+/// Runs until the launcher says stop.
+pub fn run(ctx: Context) -> Result<(), RunError> {
+    let config: Config = ctx.config()?;
+    if config.backend != Backend::Virtual {
+        return Err(RunError::Backend(config.backend));
+    }
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .map_err(system("starting the event loop"))?;
+    tokio::task::LocalSet::new().block_on(&runtime, serve(ctx, &config))
+}
+
+/// The rail as the bus sees it.
+struct Rail {
+    ctx: Context,
+    rx: Publisher<CanFrame>,
+    tx: Subscriber<CanFrame>,
+    /// Frames of the rail that cannot exist on a CAN bus.
+    invalid: u64,
+    unpublished: u64,
+    event_budget: u32,
+    events_left_out: u32,
+}
+
+impl Tap for Rail {
+    fn frame(&mut self, frame: &Frame, t_ns: u64, origin: Origin) {
+        let message = CanFrame {
+            can_id: frame.can_id,
+            len: frame.len,
+            fd_flags: frame.fd,
+            flags: if origin == Origin::Rail { can_flag::TX_ECHO } else { 0 },
+            data: frame.data,
+            ..CanFrame::default()
+        };
+        if self.rx.send_at(message, &[], t_ns).is_err() {
+            self.unpublished += 1;
+        }
+    }
+}
+
+impl Host for Rail {
+    fn flush(&mut self) {
+        self.rx.ring();
+    }
+
+    fn client(&mut self, message: String, refused: bool) {
+        if self.event_budget == 0 {
+            self.events_left_out += 1;
+            return;
+        }
+        self.event_budget -= 1;
+        let level = if refused { Level::Warning } else { Level::Info };
+        self.ctx.event(EventKind::Client, level, message, serde_json::Value::Null);
+    }
+}
+
+impl Rail {
+    /// Moves frames of the stack into the bus's queue as far as it has room; what stays in the topic makes the
+    /// topic full, and its writers are told. Returns whether more may wait.
+    fn take_tx(&mut self, bus: &mut VirtualBus, now_ns: u64) -> bool {
+        let limit = bus.rail_room().min(TAKE_FRAMES);
+        let invalid = &mut self.invalid;
+        let taken = self.tx.drain(limit, |message, _| {
+            let frame =
+                Frame { can_id: message.can_id, len: message.len, fd: message.fd_flags, data: message.data };
+            if frame.validate().is_err() || frame.is_error() {
+                *invalid += 1;
+                return;
+            }
+            let newest = message.flags & can_flag::NEWEST != 0;
+            let pushed = bus.push_rail(&frame, newest, now_ns);
+            debug_assert_ne!(pushed, Pushed::Refused, "room was asked for");
+        });
+        limit > 0 && taken == limit
+    }
+
+    fn second(&mut self) {
+        if self.events_left_out > 0 {
+            let message = format!("{} more client events in the last second left out", self.events_left_out);
+            self.ctx.event(EventKind::Client, Level::Warning, message, serde_json::Value::Null);
+        }
+        self.event_budget = CLIENT_EVENTS;
+        self.events_left_out = 0;
+    }
+}
+
+/// What `<can>/status` says.
+#[derive(Serialize)]
+struct Status<'a> {
+    backend: &'static str,
+    bitrate: u32,
+    data_bitrate: u32,
+    pace: bool,
+    /// Frames of others: clients and feed.
+    rx: u64,
+    /// Frames of the stack.
+    tx: u64,
+    /// Per mille of the last second.
+    load_permille: u32,
+    bus: BusCounters,
+    tx_queue: TxCounters,
+    tx_waiting: usize,
+    tx_invalid: u64,
+    rx_unpublished: u64,
+    clients: &'a [ClientStatus],
+    clients_refused: u64,
+    feed_rounds: Option<u64>,
+}
+
+fn publish_status(hub: &Hub<Rail>, config: &Config) {
+    let clients = hub.clients();
+    let (clients_refused, feed_rounds) = (hub.refused(), hub.feed_rounds());
+    hub.look(|bus, rail| {
+        bus.set_utc_offset(clock::utc_offset_ns());
+        let counters = bus.counters();
+        let status = Status {
+            backend: "virtual",
+            bitrate: config.bitrate.0,
+            data_bitrate: config.data_bitrate.0,
+            pace: config.pace,
+            rx: counters.frames - counters.from_rail,
+            tx: counters.from_rail,
+            load_permille: bus.load_permille(clock::mono_ns()),
+            bus: counters,
+            tx_queue: bus.tx_counters(),
+            tx_waiting: bus.rail_waiting(),
+            tx_invalid: rail.invalid,
+            rx_unpublished: rail.unpublished,
+            clients: &clients,
+            clients_refused,
+            feed_rounds,
+        };
+        rail.ctx.status(&status);
+        rail.second();
+    });
+}
+
+fn watched(fd: std::os::fd::BorrowedFd<'_>) -> Result<AsyncFd<OwnedFd>, RunError> {
+    let owned = fd.try_clone_to_owned().map_err(system("duplicating a descriptor"))?;
+    watch::readable(owned).map_err(system("watching a descriptor"))
+}
+
+fn listener(fd: OwnedFd) -> Result<TcpListener, RunError> {
+    let listener = std::net::TcpListener::from(fd);
+    listener.set_nonblocking(true).map_err(system("setting up an inherited listener"))?;
+    TcpListener::from_std(listener).map_err(system("watching an inherited listener"))
+}
+
+async fn serve(mut ctx: Context, config: &Config) -> Result<(), RunError> {
+    let service = ctx.service.clone();
+    let feed = match &config.feed {
+        Some(feed) => {
+            let log = Log::load(&ctx.stack.dir.join(&feed.file), feed.bus.as_deref())?;
+            tracing::info!("feed: {} frames from {}", log.len(), feed.file.display());
+            Some(Player::new(log, feed.speed, feed.repeat, feed.gap.ns(), clock::mono_ns()))
+        }
+        None => None,
+    };
+    let mut inbox = ctx.inbox()?;
+    let inbox_fd = watched(inbox.fd())?;
+    let shutdown = watched(ctx.shutdown_fd())?;
+    let mut listeners = Vec::new();
+    for (name, endpoint) in config.endpoints() {
+        let dialect = if name == "slcan" { Dialect::Slcan } else { Dialect::Socketcand };
+        listeners.push((listener(ctx.take_fd(name)?)?, dialect, endpoint));
+    }
+    let rail = Rail {
+        rx: ctx.publisher(&TopicKind::CanRx.of(&service))?,
+        tx: ctx.subscriber(&TopicKind::CanTx.of(&service))?,
+        ctx,
+        invalid: 0,
+        unpublished: 0,
+        event_budget: CLIENT_EVENTS,
+        events_left_out: 0,
+    };
+    let hub =
+        Hub::new(config.settings(&service), rail, feed).map_err(system("making the clock of the bus"))?;
+    for (listener, dialect, endpoint) in listeners {
+        let max_clients = endpoint.max_clients as usize;
+        tokio::task::spawn_local(hub.clone().serve(listener, dialect, endpoint.filter, max_clients));
+    }
+    publish_status(&hub, config);
+    hub.look(|_, rail| rail.ctx.ready());
+    // Starts the feed.
+    hub.turn(|_, _, _| ());
+    work(&hub, config, &mut inbox, &inbox_fd, &shutdown).await
+}
+
+async fn work(
+    hub: &Rc<Hub<Rail>>,
+    config: &Config,
+    inbox: &mut Inbox,
+    inbox_fd: &AsyncFd<OwnedFd>,
+    shutdown: &AsyncFd<OwnedFd>,
+) -> Result<(), RunError> {
+    let mut beat = tokio::time::interval(BEAT);
+    beat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    let mut beats = 0u32;
+    loop {
+        tokio::select! {
+            end = shutdown.readable() => {
+                end.map_err(system("waiting for the end"))?.retain_ready();
+                return Ok(());
+            }
+            rang = inbox_fd.readable() => {
+                let mut guard = rang.map_err(system("waiting for the rail"))?;
+                inbox.drain();
+                guard.clear_ready();
+                while hub.turn(|bus, rail, now_ns| rail.take_tx(bus, now_ns)) {
+                    tokio::task::yield_now().await;
+                }
+            }
+            due = hub.alarm() => {
+                due.map_err(system("waiting for the clock of the bus"))?;
+                // A paced bus has room again: what waits in the topic goes on.
+                hub.turn(|bus, rail, now_ns| rail.take_tx(bus, now_ns));
+            }
+            _ = beat.tick() => {
+                beats += 1;
+                hub.look(|_, rail| rail.ctx.beat());
+                if beats.is_multiple_of(STATUS_BEATS) {
+                    publish_status(hub, config);
+                }
+            }
+        }
+    }
+}

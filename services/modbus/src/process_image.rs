@@ -1,0 +1,306 @@
+//! The register map on the rail: what [`crate::server::answer`] reads and writes in a running stack.
+//!
+//! Reads come from the [`View`]; writes become one [`ipc_types::payload::ImageWrite`] each, or go into the part of %I that the
+//! server owns. The rail itself is behind the trait [`Rail`], so that all of this is tested without one.
+
+use crate::config::OnStop;
+use crate::map::{Destination, Memory, RegisterMap};
+use crate::protocol::pdu::Exception;
+use crate::server::{Access, Image, Table, Write};
+use crate::tcp::Backend;
+use crate::view::View;
+use crate::watchdog::{Watchdog, WatchdogState};
+use crate::write_set::WriteSet;
+use ipc_types::image_write::Builder;
+use ipc_types::payload::{self, PlcState, Quality};
+
+/// Owned inputs are sent again after this time, because a late reader only gets them then.
+const RESEND_NS: u64 = 100_000_000;
+
+/// Why a write was not queued.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum NotQueued {
+    /// The PLC's queue is full.
+    Full,
+    /// Nobody reads the queue, or the rail failed.
+    NoReader,
+}
+
+/// The ports of the service.
+pub trait Rail {
+    /// CLOCK_MONOTONIC in ns.
+    fn now_ns(&self) -> u64;
+    /// Hands over the newest image if there is one not seen yet.
+    fn newest(&mut self, take: &mut dyn FnMut(&payload::Image, &[u8]));
+    /// Queues a write to the PLC; its `seq`.
+    fn write(&mut self, write: &Builder) -> Result<u64, NotQueued>;
+    /// Publishes the owned part of %I: bytes of all ranges, then their qualities. `false` when it failed.
+    fn publish_inputs(&mut self, ranges: u32, data_t_ns: u64, tail: &[u8]) -> bool;
+}
+
+/// Counters of writes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+pub struct WriteCounters {
+    /// Queued to the PLC.
+    pub queued: u64,
+    /// Refused with exception 06: queue full.
+    pub full: u64,
+    /// Refused with exception 04: nobody takes them.
+    pub no_reader: u64,
+    /// Into the server's own part of %I.
+    pub own: u64,
+}
+
+/// The part of %I that the server owns.
+struct OwnInputs {
+    /// Byte offset and length.
+    ranges: Vec<(u32, u32)>,
+    /// All of %I up to the end of the last range, only the ranges used.
+    bytes: Vec<u8>,
+    tail: Vec<u8>,
+    quality: Quality,
+    data_t_ns: u64,
+    sent_ns: u64,
+    dirty: bool,
+}
+
+impl OwnInputs {
+    fn new(ranges: Vec<(u32, u32)>) -> Self {
+        let end = ranges.last().map_or(0, |(start, len)| start + len) as usize;
+        let tail = ranges.iter().map(|(_, len)| *len as usize + 1).sum();
+        Self {
+            ranges,
+            bytes: vec![0; end],
+            tail: Vec::with_capacity(tail),
+            quality: Quality::NoData,
+            data_t_ns: 0,
+            sent_ns: 0,
+            dirty: true,
+        }
+    }
+
+    fn write(&mut self, set: &WriteSet, now_ns: u64) {
+        for run in set.runs() {
+            let _ = run.op().apply(&mut self.bytes);
+        }
+        self.data_t_ns = now_ns;
+        self.quality = Quality::Good;
+        self.dirty = true;
+    }
+
+    fn publish(&mut self, rail: &mut impl Rail, now_ns: u64) {
+        if self.ranges.is_empty() {
+            return;
+        }
+        self.tail.clear();
+        for (start, len) in &self.ranges {
+            let range = *start as usize..(start + len) as usize;
+            self.tail.extend_from_slice(self.bytes.get(range).unwrap_or_default());
+        }
+        self.tail.extend(self.ranges.iter().map(|_| self.quality as u8));
+        self.dirty = !rail.publish_inputs(self.ranges.len() as u32, self.data_t_ns, &self.tail);
+        self.sent_ns = now_ns;
+    }
+}
+
+/// What changed since the last [`ProcessImage::tick`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Change {
+    /// Requests are answered by exception 04 from now on.
+    NotServing,
+    /// ... and are carried out again.
+    Serving,
+    /// No client has written in time: the watchdog's values were sent.
+    WatchdogFired,
+    /// A client writes again.
+    WatchdogCleared,
+}
+
+/// The image behind the server in a running stack.
+pub struct ProcessImage<R> {
+    rail: R,
+    view: View,
+    map: RegisterMap,
+    on_stop: OnStop,
+    own: OwnInputs,
+    watchdog: Option<Watchdog>,
+    set: WriteSet,
+    builder: Builder,
+    /// Taken once a batch.
+    now_ns: u64,
+    counters: WriteCounters,
+    serving: Option<bool>,
+}
+
+impl<R: Rail> ProcessImage<R> {
+    /// An image that has not seen the PLC yet.
+    pub fn new(rail: R, view: View, map: RegisterMap, on_stop: OnStop, watchdog: Option<Watchdog>) -> Self {
+        let own = OwnInputs::new(map.own_inputs());
+        let now_ns = rail.now_ns();
+        Self {
+            rail,
+            view,
+            map,
+            on_stop,
+            own,
+            watchdog,
+            set: WriteSet::default(),
+            builder: Builder::default(),
+            now_ns,
+            counters: WriteCounters::default(),
+            serving: None,
+        }
+    }
+
+    /// The ports.
+    pub fn rail(&self) -> &R {
+        &self.rail
+    }
+
+    /// Image and overlay.
+    pub fn view(&self) -> &View {
+        &self.view
+    }
+
+    /// Counters of writes.
+    pub fn write_counters(&self) -> WriteCounters {
+        self.counters
+    }
+
+    /// State of the watchdog; `None` without one.
+    pub fn watchdog(&self) -> Option<WatchdogState> {
+        self.watchdog.as_ref().map(Watchdog::state)
+    }
+
+    /// Whether reads are carried out now.
+    pub fn is_serving(&self) -> bool {
+        self.ready(Access::Read).is_ok()
+    }
+
+    /// Work that is not caused by a request; call it at least every 100 ms.
+    pub fn tick(&mut self, mut changed: impl FnMut(Change)) {
+        self.begin();
+        let serving = self.is_serving();
+        if self.serving.replace(serving).is_some_and(|before| before != serving) {
+            changed(if serving { Change::Serving } else { Change::NotServing });
+        }
+        if let Some(watchdog) = &mut self.watchdog {
+            if watchdog.take_cleared() {
+                changed(Change::WatchdogCleared);
+            }
+            if watchdog.is_due(self.now_ns) && self.fire_watchdog() {
+                changed(Change::WatchdogFired);
+            }
+        }
+        if self.own.dirty || self.now_ns.saturating_sub(self.own.sent_ns) >= RESEND_NS {
+            self.own.publish(&mut self.rail, self.now_ns);
+        }
+    }
+
+    /// Sends the watchdog's values; `false` when they could not be queued, then it stays due.
+    fn fire_watchdog(&mut self) -> bool {
+        let Some(watchdog) = &mut self.watchdog else { return false };
+        if watchdog.values().ops() > 0 {
+            let Ok(seq) = self.rail.write(watchdog.values()) else { return false };
+            self.view.overlay(seq, self.now_ns, watchdog.values());
+        }
+        watchdog.fired();
+        if self.own.quality == Quality::Good {
+            self.own.quality = Quality::Stale;
+            self.own.dirty = true;
+        }
+        true
+    }
+
+    fn memory(&self) -> Memory<'_> {
+        Memory { own_input: &self.own.bytes, ..self.view.memory() }
+    }
+
+    fn queue(&mut self) -> Result<(), Exception> {
+        if self.view.is_full() {
+            self.counters.full += 1;
+            return Err(Exception::ServerDeviceBusy);
+        }
+        self.set.build(&mut self.builder).map_err(|_| Exception::ServerDeviceFailure)?;
+        match self.rail.write(&self.builder) {
+            Ok(seq) => {
+                self.counters.queued += 1;
+                self.view.overlay(seq, self.now_ns, &self.builder);
+                Ok(())
+            }
+            Err(NotQueued::Full) => {
+                self.counters.full += 1;
+                Err(Exception::ServerDeviceBusy)
+            }
+            Err(NotQueued::NoReader) => {
+                self.counters.no_reader += 1;
+                Err(Exception::ServerDeviceFailure)
+            }
+        }
+    }
+}
+
+impl<R: Rail> Backend for ProcessImage<R> {
+    fn begin(&mut self) {
+        let Self { rail, view, map, .. } = self;
+        rail.newest(&mut |header, tail| {
+            if let Some(sizes) = view.take(header, tail) {
+                map.set_sizes(sizes);
+            }
+        });
+        self.now_ns = self.rail.now_ns();
+        self.view.expire(self.now_ns);
+    }
+}
+
+impl<R: Rail> Image for ProcessImage<R> {
+    fn check(&self, access: Access, table: Table, address: u16, quantity: u16) -> Result<(), Exception> {
+        self.map.check(access, table, address, quantity)
+    }
+
+    /// Reads need an image that is fresh and in state RUN, or with `on_stop = "hold"` any image. Writes need a
+    /// fresh one in any case: nobody would apply them.
+    fn ready(&self, access: Access) -> Result<(), Exception> {
+        let fresh = self.view.is_fresh(self.now_ns);
+        let Some(newest) = self.view.newest() else { return Err(Exception::ServerDeviceFailure) };
+        let ready = match (self.on_stop, access) {
+            (OnStop::Exception, _) => fresh && newest.state == PlcState::Run,
+            (OnStop::Hold, Access::Read) => true,
+            (OnStop::Hold, Access::Write) => fresh,
+        };
+        if ready { Ok(()) } else { Err(Exception::ServerDeviceFailure) }
+    }
+
+    fn read_bits(
+        &mut self,
+        table: Table,
+        address: u16,
+        quantity: u16,
+        out: &mut [u8],
+    ) -> Result<(), Exception> {
+        self.map.read_bits(&self.memory(), table, address, quantity, out)
+    }
+
+    fn read_words(&mut self, table: Table, address: u16, out: &mut [u8]) -> Result<(), Exception> {
+        self.map.read_words(&self.memory(), table, address, out)
+    }
+
+    fn write(&mut self, write: &Write<'_>) -> Result<(), Exception> {
+        match self.map.plan(write, &mut self.set)? {
+            Destination::Plc => self.queue()?,
+            Destination::OwnInputs => {
+                self.own.write(&self.set, self.now_ns);
+                self.own.publish(&mut self.rail, self.now_ns);
+                self.counters.own += 1;
+            }
+        }
+        if let Some(watchdog) = &mut self.watchdog {
+            watchdog.written(self.now_ns);
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+#[path = "process_image_tests.rs"]
+mod tests;

@@ -1,0 +1,187 @@
+use super::*;
+use insta::assert_snapshot;
+
+fn config(json: &str) -> Config {
+    serde_json::from_str(json).unwrap()
+}
+
+fn neighbours(plcs: &[&str]) -> Neighbours {
+    Neighbours {
+        name: "modbus".to_owned(),
+        services: plcs.iter().map(|name| ((*name).to_owned(), "plc".to_owned())).collect(),
+        ..Neighbours::default()
+    }
+}
+
+fn check_it(config: &Config, stack: &Stack) -> Vec<Finding> {
+    let me = ServiceEntry {
+        name: "modbus".to_owned(),
+        kind: KIND.to_owned(),
+        index: 9,
+        config: serde_json::Value::Null,
+        wiring: Wiring::default(),
+    };
+    check(config, stack, &me)
+}
+
+fn stack(plcs: &[(&str, &str)]) -> Stack {
+    let services = plcs
+        .iter()
+        .enumerate()
+        .map(|(i, (name, config))| ServiceEntry {
+            name: (*name).to_owned(),
+            kind: "plc".to_owned(),
+            index: i as u32 + 1,
+            config: serde_json::from_str(config).unwrap(),
+            wiring: Wiring::default(),
+        })
+        .collect();
+    Stack {
+        name: "test".to_owned(),
+        file: "test.toml".into(),
+        dir: ".".into(),
+        text: String::new(),
+        build_id: String::new(),
+        root: "/nowhere".into(),
+        prefix: "x".to_owned(),
+        services,
+        topics: Vec::new(),
+    }
+}
+
+#[test]
+fn wiring_of_the_default() {
+    let wiring = topics(&Config::default(), &neighbours(&["plc"]));
+    assert_eq!(
+        wiring.reads.iter().map(|r| (r.topic.as_str(), r.wake)).collect::<Vec<_>>(),
+        [("plc/image", false)]
+    );
+    assert_eq!(wiring.writes, [("plc/writes".to_owned(), "plc".to_owned())]);
+    assert_eq!(wiring.plc.as_deref(), Some("plc"));
+    assert!(wiring.topics.is_empty() && wiring.inputs.is_empty());
+    assert_eq!(wiring.listeners.len(), 1);
+    assert_eq!(wiring.listeners[0].address.to_string(), "0.0.0.0:502");
+    assert!(topics(&config(r#"{ "enable": false }"#), &neighbours(&["plc"])).listeners.is_empty());
+    assert!(topics(&Config::default(), &neighbours(&["a", "b"])).plc.is_none());
+    assert_eq!(topics(&config(r#"{ "plc": "b" }"#), &neighbours(&["a", "b"])).plc.as_deref(), Some("b"));
+}
+
+#[test]
+fn owned_inputs_are_declared_with_room_for_their_message() {
+    let config = config(
+        r#"{ "map": [ { "table": "holding", "at": 0, "count": 4096, "area": "%IW16", "own": true },
+                      { "table": "coils", "at": 0, "count": 16, "area": "%IX0.0", "own": true },
+                      { "table": "coils", "at": 20, "count": 10, "area": "%QX1.7" } ] }"#,
+    );
+    let wiring = topics(&config, &neighbours(&["plc"]));
+    let ranges: Vec<_> =
+        wiring.inputs.iter().map(|r| (r.byte, r.bytes, r.key.as_str(), r.label.as_str())).collect();
+    assert_eq!(
+        ranges,
+        [
+            (0, 2, "map[1].area", "coils 0.. written by Modbus clients"),
+            (32, 8192, "map[0].area", "holding_registers 0.. written by Modbus clients")
+        ]
+    );
+    let shown: Vec<_> = wiring.outputs.iter().map(|r| (r.area, r.byte, r.bytes, r.label.as_str())).collect();
+    assert_eq!(shown, [(Area::Output, 1, 3, "coils 20-29")]);
+    assert_eq!(wiring.topics.len(), 1);
+    assert_eq!(wiring.topics[0].max_tail, 8196);
+}
+
+#[test]
+fn a_good_table_has_no_findings() {
+    let good = config(r#"{ "tcp": { "address": "127.0.0.1" } }"#);
+    assert_eq!(check_it(&good, &stack(&[("plc", "{}")])), []);
+}
+
+#[test]
+fn findings_name_key_mistake_and_remedy() {
+    let one = [("plc", "{}")];
+    let local = r#""tcp": { "address": "127.0.0.1" }"#;
+    let cases: &[(&str, &[(&str, &str)])] = &[
+        ("{}", &one),
+        (r#"{ "tcp": { "address": "127.0.0.1", "max_connections": 0 } }"#, &one),
+        (
+            r#"{ "tcp": { "filter": { "mask": "255.255.255.0", "start": "10.0.0.9", "end": "10.0.0.1" } } }"#,
+            &one,
+        ),
+        (&format!("{{ {local} }}"), &[]),
+        (&format!("{{ {local} }}"), &[("a", "{}"), ("b", "{}")]),
+        (&format!(r#"{{ {local}, "plc": "c" }}"#), &[("a", "{}"), ("b", "{}")]),
+        (&format!("{{ {local} }}"), &[("plc", r#"{ "addressing": "byte" }"#)]),
+        (&format!(r#"{{ {local}, "stale_after": "0" }}"#), &one),
+        (&format!(r#"{{ {local}, "stale_after": "10ms" }}"#), &one),
+        (&format!(r#"{{ {local}, "units": [] }}"#), &one),
+        (
+            &format!(
+                r#"{{ {local}, "map": [ {{ "table": "coils", "at": 0, "count": 1, "area": "%QW0" }} ] }}"#
+            ),
+            &one,
+        ),
+        (&format!(r#"{{ {local}, "write_watchdog": "2s" }}"#), &one),
+        (&format!(r#"{{ {local}, "watchdog_values": [ {{ "to": "%QB0", "value": 1 }} ] }}"#), &one),
+        (
+            &format!(
+                r#"{{ {local}, "write_watchdog": "50ms", "watchdog_values": [ {{ "to": "%QB0", "value": 256 }} ] }}"#
+            ),
+            &one,
+        ),
+    ];
+    let mut text = String::new();
+    for (json, plcs) in cases {
+        let findings = check_it(&config(json), &stack(plcs));
+        assert!(!findings.is_empty(), "{json}");
+        for f in findings {
+            text.push_str(&format!("{:?} {}: {} -> {}\n", f.severity, f.key, f.message, f.help));
+        }
+    }
+    assert_snapshot!(text, @r#"
+Warning tcp: Modbus has no passwords: whoever reaches this port can write outputs and markers -> add filter = { mask = ..., start = ..., end = ... }, or address = "127.0.0.1"
+Error tcp.max_connections: max_connections = 0 is not 1 to 1024 -> 8 is the default
+Error tcp.filter: filter: start 10.0.0.9 lies behind end 10.0.0.1: nobody could connect -> exchange start and end, or correct them
+Error plc: the stack has no plc service whose image could be served -> add a [[service]] with kind = "plc"; it works without a program too
+Error plc: the stack has 2 plc services; which one is served? -> set plc to one of: a, b
+Error plc: there is no plc service 'c' -> set plc to one of: a, b
+Error addressing: %-addresses count differently here than in 'plc' ("byte") -> set addressing = "byte" here too
+Error stale_after: stale_after is 0, so every image would be too old -> leave it out (200ms) or set a longer time
+Warning stale_after: stale_after = 10ms is short: a PLC process delayed by the system looks dead -> 200ms is the default; give at least 3 times the longest time between two scans
+Warning units: only units 0 and 255 are served -> leave units out to serve all, or list unit identifiers
+Error map[0]: map table 1: coils shows single bits, so area must be %QX... or %QB...; got %QW0 -> see the page on the Modbus server for what a [[service.map]] table takes
+Error write_watchdog: the watchdog has nothing to write -> add watchdog_values = [ { to = "%QW0", value = 0 } ]
+Error watchdog_values: values without write_watchdog -> set write_watchdog, e.g. "2s", or remove the values
+Error watchdog_values[0]: watchdog value 1: 256 does not fit %QB0, which takes -128 to 255 -> correct or remove the value
+Error write_watchdog: write_watchdog = 50ms is shorter than it is looked at -> set at least "100ms", and twice the clients' period
+"#);
+}
+
+#[test]
+fn the_largest_status_fits_its_topic() {
+    let client = ClientInfo {
+        address: "2001:db8:1111:2222:3333:4444:5555:6666".parse().unwrap(),
+        port: 65535,
+        connected_s: u64::from(u32::MAX),
+        idle_s: u64::from(u32::MAX),
+        requests: u64::MAX / 2,
+        exceptions: u64::MAX / 2,
+        last_unit: 255,
+        last_function: 255,
+    };
+    let body = StatusBody {
+        listen: Some("[2001:db8:1111:2222:3333:4444:5555:6666]:65535".parse().unwrap()),
+        serving: false,
+        plc_state: Some(PlcState::Starting),
+        plc_generation: Some(u32::MAX),
+        image_age_ms: Some(u64::MAX),
+        clients: 1024,
+        client_list: vec![client; MAX_LISTED_CLIENTS],
+        counters: Counters { requests: u64::MAX, by_exception: [u64::MAX; 12], ..Counters::default() },
+        writes: WriteCounters::default(),
+        writes_pending: 256,
+        writes_refused_by_plc: u64::MAX,
+        watchdog: Some(WatchdogState::Waiting),
+        image: ReadCounters::default(),
+    };
+    let bytes = serde_json::to_vec(&body).unwrap().len();
+    assert!(bytes <= TopicKind::Status.row().max_tail as usize, "{bytes}");
+}

@@ -1,0 +1,477 @@
+//! Modbus TCP connections on a current-thread tokio runtime.
+//!
+//! A [`Hub`] holds what all connections share: the image, the rules of admission, the list of clients, the
+//! counters. Every connection is one local task that reads, lets its [`Session`] answer, and writes once. No
+//! task holds the image across an await, so one request is always served from one state of it.
+
+use crate::server::Image;
+use crate::session::{MAX_EXCEPTION, Next, Session, SessionCounts, UnitRule};
+use ipc_types::net::IpFilter;
+use serde::{Deserialize, Serialize};
+use std::cell::{Cell, RefCell};
+use std::fmt;
+use std::io;
+use std::net::{IpAddr, SocketAddr};
+use std::rc::Rc;
+use std::time::{Duration, Instant};
+use tokio::io::AsyncReadExt;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Notify;
+
+/// A peer that does not take its answers is dropped after this time.
+const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
+/// Pause after an accept that failed for want of descriptors or memory.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+/// Happenings kept between two calls of [`Hub::take_happenings`]; a flood of connections must not flood the rail.
+const MAX_HAPPENINGS: usize = 8;
+
+/// The image as the hub uses it.
+pub trait Backend: Image {
+    /// Called before each batch of requests: take the newest state of the image.
+    fn begin(&mut self);
+}
+
+/// What happens to a connection when all places are taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum WhenFull {
+    /// The new connection is closed.
+    #[default]
+    Refuse,
+    /// The connection that has been without a request for longest, at least [`Options::min_idle`], makes room;
+    /// without such a one the new connection is closed.
+    CloseOldestIdle,
+}
+
+/// Rules of admission.
+#[derive(Clone, Debug)]
+pub struct Options {
+    pub max_connections: usize,
+    pub filter: Option<IpFilter>,
+    pub units: UnitRule,
+    /// A connection without a request for this long is closed; `None` = never.
+    pub idle_timeout: Option<Duration>,
+    pub when_full: WhenFull,
+    /// How long a connection must have been idle to be closed for another one.
+    pub min_idle: Duration,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            max_connections: 8,
+            filter: None,
+            units: UnitRule::any(),
+            idle_timeout: Some(Duration::from_mins(1)),
+            when_full: WhenFull::Refuse,
+            min_idle: Duration::from_secs(1),
+        }
+    }
+}
+
+/// Why a connection ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum CloseReason {
+    /// The peer closed it.
+    Peer,
+    /// Reading or writing failed.
+    Error,
+    /// The length field of a header was impossible.
+    BadLength,
+    /// No request for [`Options::idle_timeout`].
+    Idle,
+    /// It made room for another one.
+    Replaced,
+    /// The peer did not take its answers.
+    NotReading,
+    /// The server was switched off.
+    Disabled,
+}
+
+/// Counters since the service started.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Counters {
+    pub accepted: u64,
+    /// Closed before a byte was read: not in the filter's range.
+    pub refused_filter: u64,
+    /// Closed before a byte was read: all places taken.
+    pub refused_full: u64,
+    /// Closed before a byte was read: server switched off.
+    pub refused_disabled: u64,
+    /// `accept` failed.
+    pub accept_errors: u64,
+    pub requests: u64,
+    pub exceptions: u64,
+    /// By exception code, index 0 unused.
+    pub by_exception: [u64; MAX_EXCEPTION + 1],
+    /// Frames of another protocol, dropped without an answer.
+    pub foreign: u64,
+    pub closed_peer: u64,
+    pub closed_error: u64,
+    pub closed_bad_length: u64,
+    pub closed_idle: u64,
+    pub closed_replaced: u64,
+    pub closed_not_reading: u64,
+    pub closed_disabled: u64,
+}
+
+impl Counters {
+    fn closed(&mut self, reason: CloseReason) {
+        *match reason {
+            CloseReason::Peer => &mut self.closed_peer,
+            CloseReason::Error => &mut self.closed_error,
+            CloseReason::BadLength => &mut self.closed_bad_length,
+            CloseReason::Idle => &mut self.closed_idle,
+            CloseReason::Replaced => &mut self.closed_replaced,
+            CloseReason::NotReading => &mut self.closed_not_reading,
+            CloseReason::Disabled => &mut self.closed_disabled,
+        } += 1;
+    }
+
+    fn add(&mut self, before: &SessionCounts, after: &SessionCounts) {
+        self.requests += after.requests - before.requests;
+        self.exceptions += after.exceptions - before.exceptions;
+        self.foreign += after.foreign - before.foreign;
+        for ((sum, old), new) in self.by_exception.iter_mut().zip(before.by_exception).zip(after.by_exception)
+        {
+            *sum += new - old;
+        }
+    }
+}
+
+/// One connected client, as shown in the status.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct ClientInfo {
+    pub address: IpAddr,
+    pub port: u16,
+    /// Seconds since it connected.
+    pub connected_s: u64,
+    /// Seconds since its last request (since it connected if there was none).
+    pub idle_s: u64,
+    pub requests: u64,
+    pub exceptions: u64,
+    pub last_unit: u8,
+    /// Function code of its last request, 0 before the first.
+    pub last_function: u8,
+}
+
+/// Something about a client that the rail is told.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Happening {
+    Connected { peer: SocketAddr },
+    Refused { peer: SocketAddr, why: Refusal },
+    Left { peer: SocketAddr, why: CloseReason, requests: u64, exceptions: u64 },
+}
+
+/// Why a connection was closed before a byte was read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Refusal {
+    Filter,
+    Full,
+    Disabled,
+}
+
+impl fmt::Display for Happening {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Connected { peer } => write!(f, "Modbus client {peer} connected"),
+            Self::Refused { peer, why: Refusal::Filter } => {
+                write!(f, "Modbus client {peer} refused: its address is outside tcp.filter")
+            }
+            Self::Refused { peer, why: Refusal::Full } => {
+                write!(f, "Modbus client {peer} refused: tcp.max_connections are in use")
+            }
+            Self::Refused { peer, why: Refusal::Disabled } => {
+                write!(f, "Modbus client {peer} refused: the server is switched off")
+            }
+            Self::Left { peer, why, requests, exceptions } => {
+                let why = match why {
+                    CloseReason::Peer => "it closed the connection",
+                    CloseReason::Error => "the connection broke",
+                    CloseReason::BadLength => "it sent a header with an impossible length",
+                    CloseReason::Idle => "it was idle for tcp.idle_timeout",
+                    CloseReason::Replaced => "it was idle and made room for another client",
+                    CloseReason::NotReading => "it did not take its answers",
+                    CloseReason::Disabled => "the server was switched off",
+                };
+                write!(f, "Modbus client {peer} left: {why}; {requests} requests, {exceptions} exceptions")
+            }
+        }
+    }
+}
+
+struct Client {
+    peer: SocketAddr,
+    since: Instant,
+    last_request: Cell<Instant>,
+    counts: Cell<SessionCounts>,
+    closing: Cell<Option<CloseReason>>,
+    wake: Notify,
+}
+
+impl Client {
+    fn close(&self, reason: CloseReason) {
+        if self.closing.get().is_none() {
+            self.closing.set(Some(reason));
+        }
+        self.wake.notify_one();
+    }
+}
+
+/// What all connections of a server share.
+pub struct Hub<B> {
+    backend: RefCell<B>,
+    options: Options,
+    enabled: Cell<bool>,
+    clients: RefCell<Vec<Rc<Client>>>,
+    counters: Cell<Counters>,
+    happenings: RefCell<Vec<Happening>>,
+    happenings_left_out: Cell<u64>,
+}
+
+impl<B: Backend + 'static> Hub<B> {
+    /// A hub without connections, enabled.
+    pub fn new(backend: B, options: Options) -> Rc<Self> {
+        Rc::new(Self {
+            backend: RefCell::new(backend),
+            options,
+            enabled: Cell::new(true),
+            clients: RefCell::new(Vec::new()),
+            counters: Cell::new(Counters::default()),
+            happenings: RefCell::new(Vec::with_capacity(MAX_HAPPENINGS)),
+            happenings_left_out: Cell::new(0),
+        })
+    }
+
+    /// Lends the image to the caller, who must not hold it across an await.
+    pub fn with_backend<R>(&self, use_it: impl FnOnce(&mut B) -> R) -> R {
+        use_it(&mut self.backend.borrow_mut())
+    }
+
+    /// Counters of all connections, gone ones included.
+    pub fn counters(&self) -> Counters {
+        self.counters.get()
+    }
+
+    /// Whether connections are accepted.
+    pub fn is_enabled(&self) -> bool {
+        self.enabled.get()
+    }
+
+    /// Switches the server on or off. Off closes every connection and refuses new ones.
+    pub fn set_enabled(&self, enabled: bool) {
+        self.enabled.set(enabled);
+        if !enabled {
+            for client in self.clients.borrow().iter() {
+                client.close(CloseReason::Disabled);
+            }
+        }
+    }
+
+    /// What happened to clients since the last call, at most 8, and how much more happened.
+    pub fn take_happenings(&self) -> (Vec<Happening>, u64) {
+        (self.happenings.borrow_mut().drain(..).collect(), self.happenings_left_out.take())
+    }
+
+    fn happened(&self, happening: Happening) {
+        let mut happenings = self.happenings.borrow_mut();
+        if happenings.len() < MAX_HAPPENINGS {
+            happenings.push(happening);
+        } else {
+            self.happenings_left_out.set(self.happenings_left_out.get() + 1);
+        }
+    }
+
+    /// The clients connected now, oldest first.
+    pub fn clients(&self) -> Vec<ClientInfo> {
+        let now = Instant::now();
+        self.clients
+            .borrow()
+            .iter()
+            .map(|client| {
+                let counts = client.counts.get();
+                ClientInfo {
+                    address: client.peer.ip().to_canonical(),
+                    port: client.peer.port(),
+                    connected_s: now.saturating_duration_since(client.since).as_secs(),
+                    idle_s: now.saturating_duration_since(client.last_request.get()).as_secs(),
+                    requests: counts.requests,
+                    exceptions: counts.exceptions,
+                    last_unit: counts.last_unit,
+                    last_function: counts.last_function,
+                }
+            })
+            .collect()
+    }
+
+    /// Closes connections that were idle for too long. Call it about every second.
+    pub fn sweep(&self) {
+        let Some(limit) = self.options.idle_timeout else { return };
+        let now = Instant::now();
+        for client in self.clients.borrow().iter() {
+            if now.saturating_duration_since(client.last_request.get()) >= limit {
+                client.close(CloseReason::Idle);
+            }
+        }
+    }
+
+    /// Accepts connections for ever. A failing accept (descriptors, memory) never ends it.
+    pub async fn accept(self: Rc<Self>, listener: TcpListener) {
+        loop {
+            match listener.accept().await {
+                Ok((stream, peer)) => self.admit(stream, peer),
+                Err(error) => {
+                    self.update(|counters| counters.accept_errors += 1);
+                    if !matches!(
+                        error.kind(),
+                        io::ErrorKind::ConnectionAborted
+                            | io::ErrorKind::ConnectionReset
+                            | io::ErrorKind::Interrupted
+                    ) {
+                        tracing::warn!(%error, "accepting a Modbus connection failed; trying again");
+                        tokio::time::sleep(ACCEPT_PAUSE).await;
+                    }
+                }
+            }
+        }
+    }
+
+    fn update(&self, change: impl FnOnce(&mut Counters)) {
+        let mut counters = self.counters.get();
+        change(&mut counters);
+        self.counters.set(counters);
+    }
+
+    /// Takes a connection in or closes it. Nothing is read from a connection that is refused.
+    fn admit(self: &Rc<Self>, stream: TcpStream, peer: SocketAddr) {
+        if !self.enabled.get() {
+            self.update(|counters| counters.refused_disabled += 1);
+            return self.happened(Happening::Refused { peer, why: Refusal::Disabled });
+        }
+        if self.options.filter.is_some_and(|filter| !filter.allows(peer.ip())) {
+            self.update(|counters| counters.refused_filter += 1);
+            return self.happened(Happening::Refused { peer, why: Refusal::Filter });
+        }
+        if self.clients.borrow().len() >= self.options.max_connections && !self.make_room() {
+            self.update(|counters| counters.refused_full += 1);
+            return self.happened(Happening::Refused { peer, why: Refusal::Full });
+        }
+        // Without it Nagle's algorithm and delayed acknowledgement cost 40 ms a round.
+        if stream.set_nodelay(true).is_err() {
+            self.update(|counters| counters.closed(CloseReason::Error));
+            return;
+        }
+        self.update(|counters| counters.accepted += 1);
+        self.happened(Happening::Connected { peer });
+        let now = Instant::now();
+        let client = Rc::new(Client {
+            peer,
+            since: now,
+            last_request: Cell::new(now),
+            counts: Cell::new(SessionCounts::default()),
+            closing: Cell::new(None),
+            wake: Notify::new(),
+        });
+        self.clients.borrow_mut().push(Rc::clone(&client));
+        let hub = Rc::clone(self);
+        tokio::task::spawn_local(async move {
+            let reason = hub.serve(stream, &client).await;
+            hub.clients.borrow_mut().retain(|other| !Rc::ptr_eq(other, &client));
+            hub.update(|counters| counters.closed(reason));
+            let SessionCounts { requests, exceptions, .. } = client.counts.get();
+            hub.happened(Happening::Left { peer, why: reason, requests, exceptions });
+        });
+    }
+
+    /// Closes the connection idle for longest, if the options want it and it is idle enough.
+    fn make_room(&self) -> bool {
+        if self.options.when_full != WhenFull::CloseOldestIdle {
+            return false;
+        }
+        let mut clients = self.clients.borrow_mut();
+        let oldest = clients.iter().enumerate().min_by_key(|(_, client)| client.last_request.get());
+        let Some((index, client)) = oldest else { return false };
+        if client.last_request.get().elapsed() < self.options.min_idle {
+            return false;
+        }
+        client.close(CloseReason::Replaced);
+        clients.remove(index);
+        true
+    }
+
+    async fn serve(&self, mut stream: TcpStream, client: &Client) -> CloseReason {
+        let mut session = Session::new();
+        loop {
+            let read = tokio::select! {
+                biased;
+                () = client.wake.notified() => return client.closing.get().unwrap_or(CloseReason::Disabled),
+                read = stream.read(session.space()) => read,
+            };
+            match read {
+                Ok(0) => return CloseReason::Peer,
+                Ok(n) => session.received(n),
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+                Err(_) => return CloseReason::Error,
+            }
+            loop {
+                let next = self.process(&mut session, client);
+                if let Err(reason) = send(&stream, &mut session).await {
+                    return reason;
+                }
+                match next {
+                    Next::Read => break,
+                    Next::Again => tokio::task::yield_now().await,
+                    Next::BadLength(length) => {
+                        tracing::debug!(peer = %client.peer, length, "impossible length in a Modbus header, closing");
+                        return CloseReason::BadLength;
+                    }
+                }
+                if let Some(reason) = client.closing.get() {
+                    return reason;
+                }
+            }
+        }
+    }
+
+    fn process(&self, session: &mut Session, client: &Client) -> Next {
+        let before = *session.counts();
+        let next = {
+            let mut backend = self.backend.borrow_mut();
+            backend.begin();
+            session.process(&self.options.units, &mut *backend)
+        };
+        let after = session.counts();
+        if after.requests != before.requests {
+            client.last_request.set(Instant::now());
+        }
+        client.counts.set(*after);
+        self.update(|counters| counters.add(&before, after));
+        next
+    }
+}
+
+/// Writes the whole output: one system call unless the socket's buffer is full.
+async fn send(stream: &TcpStream, session: &mut Session) -> Result<(), CloseReason> {
+    while !session.output().is_empty() {
+        match stream.try_write(session.output()) {
+            Ok(n) => session.sent(n),
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                match tokio::time::timeout(WRITE_TIMEOUT, stream.writable()).await {
+                    Ok(Ok(())) => {}
+                    Ok(Err(_)) => return Err(CloseReason::Error),
+                    Err(_) => return Err(CloseReason::NotReading),
+                }
+            }
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(_) => return Err(CloseReason::Error),
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+#[path = "tcp_tests.rs"]
+mod tests;

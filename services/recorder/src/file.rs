@@ -1,0 +1,206 @@
+//! One MCAP file being written.
+//!
+//! Small chunks compress badly and cost an index each, large ones are lost whole when the process is killed. So
+//! a chunk is closed when it is full or a second old, and until then its messages also stand *raw* behind the
+//! last chunk, as plain MCAP message records, which is where readers find them after kill -9. The chunk, when
+//! it is closed, takes their place. At every moment the file is a valid MCAP file without its end.
+
+use crate::config::Compression;
+use crate::sink::Sink;
+use mcap::records::{Metadata, MessageHeader};
+use mcap::{Attachment, McapError, McapResult, WriteOptions, Writer};
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::os::unix::fs::FileExt;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+/// Uncompressed bytes after which a chunk is closed.
+pub const CHUNK_BYTES: usize = 256 * 1024;
+/// Age after which a chunk is closed: how much a torn write of a chunk can lose at most.
+pub const CHUNK_AGE: Duration = Duration::from_secs(1);
+/// Bytes of a message record before its data: opcode, length, channel, sequence, two times.
+const MESSAGE_HEAD: usize = 1 + 8 + 2 + 4 + 8 + 8;
+const OP_MESSAGE: u8 = 0x05;
+/// zstd level: 1 is a third of the cost of the default for 10 % more bytes of what travels on a rail.
+const LEVEL: u32 = 1;
+
+/// The file. Every error leaves what was written before it readable.
+pub struct RecordingFile {
+    writer: Writer<Sink>,
+    file: Arc<File>,
+    /// Bytes of closed chunks and other records.
+    written: Arc<AtomicU64>,
+    /// Bytes of raw messages behind them.
+    raw_in_file: u64,
+    /// Raw messages that are not in the file yet.
+    raw: Vec<u8>,
+    chunk_bytes: usize,
+    chunk_since: Option<Instant>,
+}
+
+/// What a channel is made of.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ChannelSpec {
+    pub topic: String,
+    /// `ros1` or `json`.
+    pub message_encoding: String,
+    pub schema_name: String,
+    /// `ros1msg` or `jsonschema`.
+    pub schema_encoding: String,
+    pub schema: String,
+    pub metadata: BTreeMap<String, String>,
+}
+
+impl RecordingFile {
+    /// Begins an empty file; without `index` readers must go through it from the start.
+    pub fn new(file: Arc<File>, compression: Compression, index: bool) -> McapResult<Self> {
+        let written = Arc::new(AtomicU64::new(0));
+        let sink = Sink::new(file.clone(), written.clone());
+        let options = WriteOptions::new()
+            .profile("x-dinrail")
+            .library(concat!("dinrail-recorder ", env!("CARGO_PKG_VERSION")))
+            .compression(match compression {
+                Compression::Zstd => Some(mcap::Compression::Zstd),
+                Compression::None => None,
+            })
+            .compression_level(LEVEL)
+            .compression_threads(0)
+            .use_chunks(true)
+            // Never reached: chunks are closed here, because their raw messages must go with them.
+            .chunk_size(Some(16 * CHUNK_BYTES as u64))
+            .emit_message_indexes(index)
+            // Chunk indexes alone are an error to some readers (Foxglove), a file without any is not.
+            .emit_chunk_indexes(index)
+            .disable_seeking(true);
+        let writer = options.create(sink)?;
+        Ok(Self {
+            writer,
+            file,
+            written,
+            raw_in_file: 0,
+            raw: Vec::with_capacity(CHUNK_BYTES),
+            chunk_bytes: 0,
+            chunk_since: None,
+        })
+    }
+
+    /// Adds a channel; its number. Call [`Self::close_chunk`] after the last one: raw messages need their
+    /// channel before them.
+    pub fn add_channel(&mut self, spec: &ChannelSpec) -> McapResult<u16> {
+        let schema = self.writer.add_schema(&spec.schema_name, &spec.schema_encoding, spec.schema.as_bytes())?;
+        self.writer.add_channel(schema, &spec.topic, &spec.message_encoding, &spec.metadata)
+    }
+
+    /// Adds a channel of another file under its own number.
+    pub fn copy_channel(&mut self, channel: &crate::reader::Channel) -> McapResult<()> {
+        let (id, schema) = (channel.id, channel.schema_id);
+        if schema != 0 {
+            let (name, encoding) = (&channel.schema_name, &channel.schema_encoding);
+            self.writer.add_schema_with_id(schema, name, encoding, &channel.schema)?;
+        }
+        self.writer.add_channel_with_id(
+            id,
+            schema,
+            &channel.topic,
+            &channel.message_encoding,
+            &channel.metadata,
+        )?;
+        Ok(())
+    }
+
+    /// Adds a message; it is in the file after [`Self::flush`].
+    pub fn message(&mut self, head: &MessageHeader, data: &[u8], now: Instant) -> McapResult<()> {
+        let bytes = MESSAGE_HEAD + data.len();
+        if self.chunk_bytes > 0 && self.chunk_bytes + bytes > CHUNK_BYTES {
+            self.close_chunk()?;
+        }
+        self.writer.write_to_known_channel(head, data)?;
+        self.chunk_bytes += bytes;
+        self.chunk_since.get_or_insert(now);
+        self.raw.push(OP_MESSAGE);
+        self.raw.extend_from_slice(&((bytes - 9) as u64).to_le_bytes());
+        self.raw.extend_from_slice(&head.channel_id.to_le_bytes());
+        self.raw.extend_from_slice(&head.sequence.to_le_bytes());
+        self.raw.extend_from_slice(&head.log_time.to_le_bytes());
+        self.raw.extend_from_slice(&head.publish_time.to_le_bytes());
+        self.raw.extend_from_slice(data);
+        Ok(())
+    }
+
+    /// Adds a message without its raw copy: for files that nobody reads before they are finished.
+    pub fn message_chunked(&mut self, head: &MessageHeader, data: &[u8]) -> McapResult<()> {
+        if self.chunk_bytes > CHUNK_BYTES {
+            self.close_chunk()?;
+        }
+        self.chunk_bytes += MESSAGE_HEAD + data.len();
+        self.writer.write_to_known_channel(head, data)
+    }
+
+    /// Everything so far is in the file after this, in a chunk or raw.
+    pub fn flush(&mut self, now: Instant) -> McapResult<()> {
+        if self.chunk_since.is_some_and(|since| now.duration_since(since) >= CHUNK_AGE) {
+            return self.close_chunk();
+        }
+        if !self.raw.is_empty() {
+            let at = self.written.load(Ordering::Relaxed) + self.raw_in_file;
+            self.file.write_all_at(&self.raw, at)?;
+            self.raw_in_file += self.raw.len() as u64;
+            self.raw.clear();
+        }
+        Ok(())
+    }
+
+    /// Closes the chunk; it takes the place of its raw messages.
+    pub fn close_chunk(&mut self) -> McapResult<()> {
+        let raw_end = self.written.load(Ordering::Relaxed) + self.raw_in_file;
+        self.raw.clear();
+        self.raw_in_file = 0;
+        self.chunk_bytes = 0;
+        self.chunk_since = None;
+        self.writer.flush()?;
+        let end = self.written.load(Ordering::Relaxed);
+        if raw_end > end {
+            self.file.set_len(end)?;
+        }
+        Ok(())
+    }
+
+    /// Adds a metadata record.
+    pub fn metadata(&mut self, name: &str, entries: BTreeMap<String, String>) -> McapResult<()> {
+        self.close_chunk()?;
+        self.writer.write_metadata(&Metadata { name: name.to_owned(), metadata: entries })
+    }
+
+    /// Adds a file.
+    pub fn attach(&mut self, name: &str, media_type: &str, utc_ns: u64, data: &[u8]) -> McapResult<()> {
+        self.close_chunk()?;
+        self.writer.attach(&Attachment {
+            log_time: utc_ns,
+            create_time: utc_ns,
+            name: name.to_owned(),
+            media_type: media_type.to_owned(),
+            data: Cow::Borrowed(data),
+        })
+    }
+
+    /// Bytes of the file now.
+    pub fn bytes(&self) -> u64 {
+        self.written.load(Ordering::Relaxed) + self.raw_in_file
+    }
+
+    /// Writes index and end.
+    pub fn finish(mut self) -> McapResult<()> {
+        self.close_chunk()?;
+        self.writer.finish()?;
+        let mut sink = self.writer.into_inner();
+        std::io::Write::flush(&mut sink).map_err(McapError::from)
+    }
+
+    /// Gives the file up after an error: no index, what stands stays.
+    pub fn abandon(self) {
+        drop(self.writer.into_inner());
+    }
+}

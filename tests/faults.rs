@@ -1,0 +1,430 @@
+//! Any process may die at any time and its neighbours go on: one named test per way to die and per process.
+//!
+//! Every test runs a stack of five services under load, lets one die in one way, and then looks at all others:
+//! same process as before, work not interrupted, outputs as documented, the dead one back, the fault in the
+//! recording, nothing left in shared memory.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+mod support;
+
+use rustix::process::Signal;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread::{self, JoinHandle, sleep};
+use std::time::{Duration, Instant};
+use support::modbus::{Answer, Client};
+use support::{Scratch, Stack, dinrail, free_port};
+
+const SERVICES: [&str; 5] = ["rec", "can0", "io", "plc", "modbus"];
+
+fn text(modbus_port: u16, more: &str) -> String {
+    format!(
+        r#"
+[stack]
+name = "NAME"
+
+[[service]]
+name = "rec"
+kind = "recorder"
+dir = "recordings"
+{more}
+
+[[service]]
+name = "can0"
+kind = "can"
+backend = "virtual"
+feed = {{ file = "conveyor.log", loop = true }}
+{more}
+
+[[service]]
+name = "io"
+kind = "can-io"
+bus = "can0"
+{more}
+
+[[service.in]]
+id = 0x1A0
+start = 24
+len = 8
+to = "%IW0"
+type = "UINT"
+symbol = "Alive"
+timeout = "500ms"
+
+[[service.out]]
+id = 0x210
+dlc = 2
+mode = "cyclic"
+period = "50ms"
+signals = [{{ start = 0, len = 16, from = "%QW0", type = "UINT", symbol = "Out" }}]
+
+[[service]]
+name = "plc"
+kind = "plc"
+program = ["main.st"]
+cycle = "10ms"
+{more}
+
+[[service]]
+name = "modbus"
+kind = "modbus-server"
+tcp = {{ address = "127.0.0.1", port = {modbus_port} }}
+{more}
+"#
+    )
+}
+
+const PROGRAM: &str = r"
+PROGRAM main
+VAR
+  Setpoint AT %MW0 : UINT;
+  Seen AT %MW1 : UINT;
+  Scans AT %MW2 : UINT;
+  Kept AT %MW3 : UINT;
+END_VAR
+VAR RETAIN Total : UINT; END_VAR
+  Scans := Scans + 1;
+  Seen := Alive;
+  Out := Setpoint;
+  Total := Total + 1;
+  Kept := Total;
+END_PROGRAM
+";
+
+/// Asks the Modbus server all the time, reconnecting, and counts what it saw.
+struct Watch {
+    stop: Arc<AtomicBool>,
+    refused: Arc<AtomicU64>,
+    answered: Arc<AtomicU64>,
+    exceptions: Arc<AtomicU64>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Watch {
+    fn start(port: u16) -> Self {
+        let stop = Arc::new(AtomicBool::new(false));
+        let (refused, answered, exceptions) = (Arc::default(), Arc::default(), Arc::default());
+        let watch =
+            Self { stop: stop.clone(), refused, answered, exceptions, thread: None };
+        let (refused, answered, exceptions) =
+            (watch.refused.clone(), watch.answered.clone(), watch.exceptions.clone());
+        let thread = thread::spawn(move || {
+            while !stop.load(Ordering::Relaxed) {
+                let mut client = match Client::connect(port) {
+                    Ok(client) => client,
+                    Err(e) => {
+                        if e.kind() == std::io::ErrorKind::ConnectionRefused {
+                            refused.fetch_add(1, Ordering::Relaxed);
+                        }
+                        sleep(Duration::from_millis(5));
+                        continue;
+                    }
+                };
+                while !stop.load(Ordering::Relaxed) {
+                    match client.holding(0, 4) {
+                        Ok(Answer::Exception(4)) => exceptions.fetch_add(1, Ordering::Relaxed),
+                        Ok(Answer::Registers(_)) => answered.fetch_add(1, Ordering::Relaxed),
+                        Ok(other) => panic!("unexpected answer {other:?}"),
+                        Err(_) => break,
+                    };
+                    sleep(Duration::from_millis(5));
+                }
+            }
+        });
+        Self { thread: Some(thread), ..watch }
+    }
+
+    fn end(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.take().unwrap().join().unwrap();
+    }
+}
+
+fn register(port: u16, address: u16) -> Option<u16> {
+    match Client::connect(port).ok()?.holding(address, 1).ok()? {
+        Answer::Registers(values) => values.first().copied(),
+        _ => None,
+    }
+}
+
+fn changes(stack: &Stack, what: &str, port: u16, address: u16) {
+    let first = stack.wait(what, || register(port, address));
+    stack.wait(what, || register(port, address).filter(|v| *v != first));
+}
+
+/// The whole stack does its work: frames reach a register, scans go on, a setpoint reaches the bus.
+fn works(stack: &Stack, port: u16) {
+    changes(stack, "frames reach a register", port, 1);
+    changes(stack, "scans go on", port, 2);
+    let value = register(port, 0).unwrap_or(0).wrapping_add(0x0101) | 1;
+    stack.wait("a setpoint is accepted", || {
+        matches!(Client::connect(port).ok()?.write(0, value).ok()?, Answer::Written).then_some(())
+    });
+    let wanted = format!("210#{:02X}{:02X}", value & 0xFF, value >> 8);
+    stack.wait("the setpoint is on the bus", || {
+        let dump = stack.cli(&["can", "dump", "can0", "--count", "60", "--for", "2s"]);
+        compact(&String::from_utf8_lossy(&dump.stdout)).contains(&wanted).then_some(())
+    });
+}
+
+/// candump's screen lines as `ID#DATA`.
+fn compact(dump: &str) -> String {
+    dump.lines()
+        .map(|line| {
+            let mut words = line.split_whitespace().skip_while(|w| !w.chars().all(|c| c.is_ascii_hexdigit()));
+            let id = words.next().unwrap_or_default();
+            format!("{id}#{}\n", words.skip(1).collect::<String>())
+        })
+        .collect()
+}
+
+fn generations(stack: &Stack) -> BTreeMap<String, u64> {
+    stack.ps().iter().map(|r| (r["service"].as_str().unwrap().to_owned(), r["generation"].as_u64().unwrap())).collect()
+}
+
+/// How a process dies.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Way {
+    Panic,
+    Abort,
+    KillIdle,
+    KillUnderLoad,
+    Stop,
+    ExitZero,
+    Descriptors,
+}
+
+fn inject(stack: &Stack, victim: &str, what: &str) {
+    // Handlers of injected faults sit on real-time signals, only with DINRAIL_INJECT=1 in the environment.
+    let number = match what {
+        "panic" => 1,
+        "exit0" => 2,
+        _ => 3,
+    };
+    let status = std::process::Command::new("kill")
+        .args([format!("-{}", libc_rtmin() + number), stack.pid(victim).to_string()])
+        .status()
+        .unwrap();
+    assert!(status.success());
+}
+
+fn libc_rtmin() -> i32 {
+    34
+}
+
+fn case(victim: &str, way: Way) {
+    let port = free_port();
+    let scratch = Scratch::new(&format!("{victim}-{way:?}").to_lowercase());
+    scratch.write("main.st", PROGRAM);
+    scratch.write("conveyor.log", include_str!("../recordings/conveyor.log"));
+    let mut stack = Stack::spawn_in(&format!("f{victim}"), &text(port, ""), scratch, &[]);
+    stack.wait_ready();
+    works(&stack, port);
+    let before = generations(&stack);
+    let mut watch = Watch::start(port);
+
+    match way {
+        Way::Panic => inject(&stack, victim, "panic"),
+        Way::Abort => stack.kill(victim, Signal::ABORT),
+        Way::KillIdle => stack.kill(victim, Signal::KILL),
+        Way::KillUnderLoad => {
+            let mut load = load(&stack);
+            sleep(Duration::from_millis(300));
+            stack.kill(victim, Signal::KILL);
+            sleep(Duration::from_millis(300));
+            let _ = load.kill();
+            let _ = load.wait();
+        }
+        Way::Stop => stack.kill(victim, Signal::STOP),
+        Way::ExitZero => inject(&stack, victim, "exit0"),
+        Way::Descriptors => inject(&stack, victim, "descriptors"),
+    }
+    if way == Way::Descriptors {
+        // Not a death: the service must live on without a free descriptor and be well when it has some again.
+        sleep(Duration::from_millis(500));
+        changes(&stack, "scans go on", port, 2);
+        stack.ok(&["restart", victim]);
+    }
+    stack.wait_generation_above(victim, before[victim]);
+    works(&stack, port);
+    watch.end();
+
+    for (name, generation) in generations(&stack) {
+        if name != victim {
+            assert_eq!(generation, before[&name], "{name} must not be touched by the death of {victim}\n{}", stack.log());
+        }
+    }
+    // The launcher holds the listener: whoever connects while the server restarts waits, but is not refused.
+    assert_eq!(watch.refused.load(Ordering::Relaxed), 0, "connections refused");
+    assert!(watch.answered.load(Ordering::Relaxed) > 0);
+    if matches!(victim, "rec" | "can0" | "io") {
+        assert_eq!(watch.exceptions.load(Ordering::Relaxed), 0, "{victim} is no reason for exception 04");
+    }
+    assert_eq!(stack.take_down(), 0, "{}", stack.log());
+    let events = events(&stack);
+    assert!(
+        events.iter().any(|e| e["service"] == victim && (e["event"] == "died" || e["event"] == "restarting")),
+        "the fault is in the recording: {events:#?}"
+    );
+}
+
+/// Frames onto the bus as fast as the command line can.
+fn load(stack: &Stack) -> std::process::Child {
+    dinrail()
+        .args(["can", "send", "can0", "123#DEADBEEF", "--repeat", "20000", "--stack", &stack.name])
+        .stdout(std::process::Stdio::null())
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap()
+}
+
+/// Events of all recordings of a stack.
+fn events(stack: &Stack) -> Vec<serde_json::Value> {
+    let mut all = Vec::new();
+    for recording in stack.recordings() {
+        let output = dinrail()
+            .args(["recordings", "cat", "--topic", "stack/events", "--json"])
+            .arg(&recording)
+            .output()
+            .unwrap();
+        for line in String::from_utf8_lossy(&output.stdout).lines() {
+            let value: serde_json::Value = serde_json::from_str(line).unwrap();
+            let body = value.get("data").cloned().unwrap_or(value);
+            all.push(body);
+        }
+    }
+    all
+}
+
+macro_rules! ways {
+    ($($victim:ident: $($name:ident = $way:ident),*;)*) => {$(
+        mod $victim {
+            $(#[test] fn $name() { super::case(stringify!($victim), super::Way::$way) })*
+        }
+    )*};
+}
+
+ways! {
+    rec: panics = Panic, aborts = Abort, is_killed_idle = KillIdle, is_killed_under_load = KillUnderLoad,
+         hangs = Stop, exits_with_zero = ExitZero, runs_out_of_descriptors = Descriptors;
+    can0: panics = Panic, aborts = Abort, is_killed_idle = KillIdle, is_killed_under_load = KillUnderLoad,
+         hangs = Stop, exits_with_zero = ExitZero, runs_out_of_descriptors = Descriptors;
+    io: panics = Panic, aborts = Abort, is_killed_idle = KillIdle, is_killed_under_load = KillUnderLoad,
+         hangs = Stop, exits_with_zero = ExitZero, runs_out_of_descriptors = Descriptors;
+    plc: panics = Panic, aborts = Abort, is_killed_idle = KillIdle, is_killed_under_load = KillUnderLoad,
+         hangs = Stop, exits_with_zero = ExitZero, runs_out_of_descriptors = Descriptors;
+    modbus: panics = Panic, aborts = Abort, is_killed_idle = KillIdle, is_killed_under_load = KillUnderLoad,
+         hangs = Stop, exits_with_zero = ExitZero, runs_out_of_descriptors = Descriptors;
+}
+
+/// 60 kills a service make 300.
+#[test]
+fn three_hundred_kills_at_random_moments_of_start_up_brick_nothing() {
+    let port = free_port();
+    let scratch = Scratch::new("startup");
+    scratch.write("main.st", PROGRAM);
+    scratch.write("conveyor.log", include_str!("../recordings/conveyor.log"));
+    let more = "restart = { max = 1000, within = \"10s\", backoff_first = \"1ms\", backoff_max = \"2ms\" }";
+    let mut stack = Stack::spawn_in("startup", &text(port, more), scratch, &[]);
+    stack.wait_ready();
+    let mut random = 0x9E37_79B9_7F4A_7C15_u64;
+    let mut kills = 0;
+    let start = Instant::now();
+    while kills < 300 {
+        assert!(start.elapsed() < Duration::from_secs(240), "{kills} kills only\n{}", stack.log());
+        let victim = SERVICES[kills % SERVICES.len()];
+        let Some(pid) = stack.service(victim).and_then(|row| row["pid"].as_i64()) else { continue };
+        let Some(pid) = rustix::process::Pid::from_raw(pid as i32) else { continue };
+        if rustix::process::kill_process(pid, Signal::KILL).is_err() {
+            continue;
+        }
+        kills += 1;
+        random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+        sleep(Duration::from_micros((random >> 33) % 20_000));
+    }
+    stack.wait_ready();
+    works(&stack, port);
+    assert_eq!(stack.take_down(), 0, "{}", stack.log());
+}
+
+#[test]
+fn the_launcher_is_killed_no_orphan_lives_and_the_next_up_runs() {
+    let port = free_port();
+    let scratch = Scratch::new("orphans");
+    scratch.write("main.st", PROGRAM);
+    scratch.write("conveyor.log", include_str!("../recordings/conveyor.log"));
+    let mut stack = Stack::spawn_in("orphans", &text(port, ""), scratch, &[]);
+    stack.wait_ready();
+    let pids: Vec<i32> = SERVICES.iter().map(|s| stack.pid(s)).collect();
+    stack.launcher.kill().unwrap();
+    stack.launcher.wait().unwrap();
+    let killed = Instant::now();
+    support::wait_for("no orphan lives", Duration::from_secs(10), || {
+        pids.iter().all(|pid| !std::path::Path::new(&format!("/proc/{pid}")).exists()).then_some(())
+    });
+    assert!(killed.elapsed() < Duration::from_secs(4), "orphans lived for {:?}", killed.elapsed());
+    // The same stack again: what the dead launcher left is wiped.
+    let file = stack.scratch.0.join("stack.toml");
+    stack.launcher = dinrail().arg("up").arg(&file).stderr(std::process::Stdio::null()).stdout(std::process::Stdio::null()).spawn().unwrap();
+    stack.wait_ready();
+    works(&stack, port);
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn a_stopped_reader_on_the_command_line_disturbs_nobody() {
+    let port = free_port();
+    let scratch = Scratch::new("reader");
+    scratch.write("main.st", PROGRAM);
+    scratch.write("conveyor.log", include_str!("../recordings/conveyor.log"));
+    let mut stack = Stack::spawn_in("reader", &text(port, ""), scratch, &[]);
+    stack.wait_ready();
+    let before = generations(&stack);
+    let mut dump = dinrail()
+        .args(["can", "dump", "can0", "--stack", &stack.name])
+        .stdout(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    sleep(Duration::from_millis(300));
+    let pid = rustix::process::Pid::from_child(&dump);
+    rustix::process::kill_process(pid, Signal::STOP).unwrap();
+    works(&stack, port);
+    let _ = dump.kill();
+    let _ = dump.wait();
+    works(&stack, port);
+    assert_eq!(generations(&stack), before);
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn a_killed_plc_makes_outputs_safe_and_modbus_answers_exception_4_until_it_is_back() {
+    let port = free_port();
+    let scratch = Scratch::new("safe");
+    scratch.write("main.st", PROGRAM);
+    scratch.write("conveyor.log", include_str!("../recordings/conveyor.log"));
+    // The PLC may not come back by itself: what the others do without it can be seen at leisure.
+    let held = "restart = { max = 0, within = \"10s\", on_exhausted = \"hold\" }";
+    let toml = text(port, "").replace("cycle = \"10ms\"\n", &format!("cycle = \"10ms\"\n{held}\n"));
+    let mut stack = Stack::spawn_in("safe", &toml, scratch, &[]);
+    stack.wait_ready();
+    works(&stack, port);
+    stack.kill("plc", Signal::KILL);
+    stack.wait("exception 04", || {
+        (Client::connect(port).ok()?.holding(0, 1).ok()? == Answer::Exception(4)).then_some(())
+    });
+    assert_eq!(Client::connect(port).unwrap().write(0, 5).unwrap(), Answer::Exception(4));
+    // Silent: the receiver's own timeout fires. What is in flight may still come out, then nothing.
+    stack.wait("210h is no longer sent", || {
+        let dump = stack.cli(&["can", "dump", "can0", "--for", "1s"]);
+        let text = compact(&String::from_utf8_lossy(&dump.stdout));
+        (text.contains("1A0#") && !text.contains("210#")).then_some(())
+    });
+    stack.ok(&["restart", "plc"]);
+    works(&stack, port);
+    assert_eq!(stack.take_down(), 0);
+    let events = events(&stack);
+    for kind in ["died", "held", "safe_entered", "safe_left"] {
+        assert!(events.iter().any(|e| e["event"] == kind), "{kind} is missing: {events:#?}");
+    }
+}
