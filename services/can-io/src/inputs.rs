@@ -361,7 +361,7 @@ mod tests {
         ) {
             let mut table = table();
             for (can_id, payload, t_ns) in frames {
-                table.frame(can_id % 0x200 | can_id & EFF_FLAG, &payload, t_ns);
+                table.frame((can_id % 0x200) | (can_id & EFF_FLAG), &payload, t_ns);
                 table.check(t_ns.wrapping_add(MS));
                 prop_assert_eq!(table.tail().len(), 10);
                 prop_assert!(table.changes.len() <= MAX_CHANGES);

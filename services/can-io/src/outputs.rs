@@ -213,7 +213,7 @@ mod tests {
     fn sent(table: &mut OutputTable, now_ns: u64) -> (Vec<String>, Option<u64>) {
         let mut frames = Vec::new();
         let next = table.due(now_ns, |f| {
-            let data: String = f.payload.iter().map(|b| format!("{b:02X}")).collect();
+            let data = f.payload.iter().map(|b| format!("{b:02X}")).collect::<Vec<_>>().concat();
             frames.push(format!("{:X}#{data}{}", f.can_id, if f.newest { " newest" } else { "" }));
             true
         });

@@ -191,7 +191,7 @@ fn codec(
     let before = mistakes.0.len();
     let signal = Signal::new(bits.start, bits.len, bits.order)
         .map_err(|e| {
-            mistakes.add(&format!("{key}.len"), e.to_string(), "see the DBC numbering of start and len")
+            mistakes.add(&format!("{key}.len"), e.to_string(), "see the DBC numbering of start and len");
         })
         .ok();
     if bits.float && !matches!(bits.len, 32 | 64) {
@@ -351,6 +351,23 @@ fn plan_output(
         let message = format!("{} signals: a frame has at most {MAX_SIGNALS}", output.signals.len());
         mistakes.add(&format!("{key}.signals"), message, "send them in two frames");
     }
+    let signals = plan_signals(config, output, &key, mistakes);
+    let safe = safe_state(output, &signals, &key, mistakes);
+    let frame = OutputFrame {
+        index,
+        can_id: can_id?,
+        len: output.dlc as u8,
+        fd_flags: if fd { 4 | u8::from(output.brs) } else { 0 },
+        period_ns: output.period.map(|p| p.ns()),
+        inhibit_ns: output.inhibit.ns(),
+        fill: output.fill,
+        safe,
+        signals,
+    };
+    (mistakes.0.len() == before).then_some(frame)
+}
+
+fn plan_signals(config: &Config, output: &Output, key: &str, mistakes: &mut Mistakes) -> Vec<OutputPoint> {
     let mut signals = Vec::new();
     let mut covered = [0u8; 64];
     for (i, signal) in output.signals.iter().take(MAX_SIGNALS).enumerate() {
@@ -372,19 +389,7 @@ fn plan_output(
         covered.iter_mut().zip(&own).for_each(|(a, b)| *a |= b);
         signals.push(point);
     }
-    let safe = safe_state(output, &signals, &key, mistakes);
-    let frame = OutputFrame {
-        index,
-        can_id: can_id?,
-        len: output.dlc as u8,
-        fd_flags: if fd { 4 | u8::from(output.brs) } else { 0 },
-        period_ns: output.period.map(|p| p.ns()),
-        inhibit_ns: output.inhibit.ns(),
-        fill: output.fill,
-        safe,
-        signals,
-    };
-    (mistakes.0.len() == before).then_some(frame)
+    signals
 }
 
 fn plan_signal(
@@ -576,7 +581,7 @@ mod tests {
 
     #[test]
     fn limits() {
-        let inputs: Vec<_> = (0..MAX_INPUTS + 1)
+        let inputs: Vec<_> = (0..=MAX_INPUTS)
             .map(|i| json!({ "id": 1, "start": 0, "len": 8, "to": format!("%IB{i}") }))
             .collect();
         assert!(

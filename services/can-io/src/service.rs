@@ -32,6 +32,8 @@ const STATUS_BEATS: u32 = 20;
 const REPEAT_NS: u64 = 90_000_000;
 /// Frames taken from the bus before other work has its turn.
 const TAKE_FRAMES: usize = 256;
+/// `stale_after` that suffices whatever the cycle of the plc: twice its repetition.
+const ALWAYS_ENOUGH_NS: u64 = 200_000_000;
 /// Quality events a second that go to the rail.
 const QUALITY_EVENTS: u32 = 20;
 /// Frames shown in the status.
@@ -129,10 +131,12 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
         found.push(Finding::warning(name, "", "the service has neither in nor out: it does nothing", help));
         return found;
     }
-    neighbour(stack, name, ("bus", "can"), config.bus.as_deref(), &mut found);
-    let Some(plc) = neighbour(stack, name, ("plc", "plc"), config.plc.as_deref(), &mut found) else {
-        return found;
-    };
+    // A named bus or plc that leads nowhere is found by the launcher, who sees it in the wiring.
+    if config.bus.is_none() {
+        found.extend(no_only_bus(stack, name));
+    }
+    let plc = me.wiring.plc.as_deref().and_then(|plc| stack.service(plc));
+    let Some(plc) = plc.filter(|plc| plc.kind == "plc") else { return found };
     let theirs = plc.config.get("addressing").and_then(|v| v.as_str()).unwrap_or("element");
     if theirs != config.addressing.name() {
         let message = format!(
@@ -144,13 +148,19 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
     }
     for key in ["cycle", "max_interval"] {
         let span = plc.config.get(key).and_then(|v| v.as_str()).and_then(|text| text.parse::<Span>().ok());
-        if let Some(span) = span
-            && config.stale_after.ns() < span.ns().saturating_mul(3)
+        // A plc repeats its image every 100 ms even when its cycle is longer.
+        let least = span.map(|span| Span(span.ns().saturating_mul(3).min(ALWAYS_ENOUGH_NS)));
+        if let Some((span, least)) = span.zip(least)
+            && config.stale_after < least
         {
             let message =
                 format!("stale_after {} is less than 3 x {key} {span} of '{}'", config.stale_after, plc.name);
-            let help = format!("set stale_after = \"{}\" or more", Span(span.ns().saturating_mul(3)));
-            found.push(Finding::error(name, "stale_after", message, help));
+            found.push(Finding::error(
+                name,
+                "stale_after",
+                message,
+                format!("set stale_after = \"{least}\" or more"),
+            ));
         }
     }
     if config.stale_after.ns() < 1_000_000 {
@@ -164,46 +174,22 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
     found
 }
 
-/// The service named by a key, or the only one of its kind; says so when there is none.
-fn neighbour<'a>(
-    stack: &'a Stack,
-    me: &str,
-    (key, kind): (&str, &str),
-    named: Option<&str>,
-    found: &mut Vec<Finding>,
-) -> Option<&'a ServiceEntry> {
-    let of_kind: Vec<&ServiceEntry> = stack.services.iter().filter(|s| s.kind == kind).collect();
-    let names = of_kind.iter().map(|s| s.name.as_str()).collect::<Vec<_>>().join(", ");
-    match (named, of_kind.as_slice()) {
-        (Some(named), _) => {
-            let entry = of_kind.iter().find(|s| s.name == named);
-            if entry.is_none() {
-                let help = if names.is_empty() {
-                    format!("add a service of kind \"{kind}\"")
-                } else {
-                    format!("there is: {names}")
-                };
-                found.push(Finding::error(
-                    me,
-                    key,
-                    format!("no service of kind \"{kind}\" is named '{named}'"),
-                    help,
-                ));
-            }
-            entry.copied()
-        }
-        (None, [only]) => Some(only),
-        (None, []) => {
-            let message = format!("the stack has no service of kind \"{kind}\"");
-            found.push(Finding::error(me, "", message, format!("add a service of kind \"{kind}\"")));
-            None
-        }
-        (None, _) => {
-            let message = format!("the stack has several services of kind \"{kind}\": {names}");
-            found.push(Finding::error(me, "", message, format!("add {key} = \"...\"")));
-            None
-        }
-    }
+/// Without the key `bus` the stack must have one bus.
+fn no_only_bus(stack: &Stack, me: &str) -> Option<Finding> {
+    let buses: Vec<&str> =
+        stack.services.iter().filter(|s| s.kind == "can").map(|s| s.name.as_str()).collect();
+    let (message, help) = match buses.as_slice() {
+        [_] => return None,
+        [] => (
+            "the stack has no service of kind \"can\"".to_owned(),
+            "add one, as [[service]] with kind = \"can\"".to_owned(),
+        ),
+        [first, ..] => (
+            format!("the stack has several services of kind \"can\": {}", buses.join(", ")),
+            format!("say which one: bus = \"{first}\""),
+        ),
+    };
+    Some(Finding::error(me, "bus", message, help))
 }
 
 /// Why outputs are in their safe state.

@@ -75,7 +75,8 @@ fn wiring() {
 #[test]
 fn findings() {
     let said = |value: Value, services: Vec<ServiceEntry>| {
-        let me = entry("io", "can-io", Value::Null);
+        let mut me = entry("io", "can-io", Value::Null);
+        me.wiring.plc = services.iter().find(|s| s.kind == "plc").map(|s| s.name.clone());
         let found = check(&config(value), &stack(services), &me);
         found.iter().map(|f| format!("{}: {} -> {}", f.key, f.message, f.help)).collect::<Vec<_>>().join("\n")
     };
@@ -91,21 +92,18 @@ fn findings() {
         said(json!({}), vec![]),
         said(demo(), vec![]),
         said(demo(), vec![can(), entry("can1", "can", json!({})), plc(json!({}))]),
-        said(with("bus", json!("can7")), vec![can(), plc(json!({}))]),
-        said(with("plc", json!("can0")), vec![can()]),
         said(demo(), vec![can(), plc(json!({ "addressing": "byte" }))]),
-        said(demo(), vec![can(), plc(json!({ "cycle": "100ms" }))]),
+        said(with("stale_after", json!("25ms")), vec![can(), plc(json!({ "cycle": "10ms" }))]),
+        said(with("stale_after", json!("150ms")), vec![can(), plc(json!({ "cycle": "1s" }))]),
         said(with("stale_after", json!("10us")), vec![can(), plc(json!({}))]),
     ];
     insta::assert_snapshot!(all.join("\n"), @r#"
         : the service has neither in nor out: it does nothing -> add [[service.in]] or [[service.out]]
-        : the stack has no service of kind "can" -> add a service of kind "can"
-        : the stack has no service of kind "plc" -> add a service of kind "plc"
-        : the stack has several services of kind "can": can0, can1 -> add bus = "..."
-        bus: no service of kind "can" is named 'can7' -> there is: can0
-        plc: no service of kind "plc" is named 'can0' -> add a service of kind "plc"
+        bus: the stack has no service of kind "can" -> add one, as [[service]] with kind = "can"
+        bus: the stack has several services of kind "can": can0, can1 -> say which one: bus = "can0"
         addressing: addresses are counted by "element" here and by "byte" in 'plc' -> set addressing = "byte"
-        stale_after: stale_after 200ms is less than 3 x cycle 100ms of 'plc' -> set stale_after = "300ms" or more
+        stale_after: stale_after 25ms is less than 3 x cycle 10ms of 'plc' -> set stale_after = "30ms" or more
+        stale_after: stale_after 150ms is less than 3 x cycle 1s of 'plc' -> set stale_after = "200ms" or more
         stale_after: stale_after must be at least 1ms -> the default is 200ms
         "#);
 }

@@ -200,13 +200,13 @@ mod tests {
                 prop_assert_eq!(queue.push(&frame, newest, 0), expected);
                 prop_assert_eq!(queue.len(), model.len());
                 if i % 7 == 6 && !model.is_empty() {
-                    model.sort();
+                    model.sort_unstable();
                     let first = model.remove(0);
                     let popped = queue.pop().unwrap();
                     prop_assert_eq!((popped.frame.id(), popped.frame.data[0]), (first.0, first.2));
                 }
             }
-            model.sort();
+            model.sort_unstable();
             for (id, _, value, _) in model {
                 let popped = queue.pop().unwrap();
                 prop_assert_eq!((popped.frame.id(), popped.frame.data[0]), (id, value));

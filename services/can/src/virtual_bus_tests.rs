@@ -225,7 +225,7 @@ fn a_paced_bus_stops_reading_and_never_drops_what_a_client_sends() {
     let mut bus = VirtualBus::new(settings(true));
     let mut tap = Seen::default();
     let a = socketcand_client(&mut bus, &mut tap);
-    let text: String = (0..1000).map(|i| format!("< send {i:03x} 0 >")).collect();
+    let text = (0..1000).map(|i| format!("< send {i:03x} 0 >")).collect::<Vec<_>>().concat();
     let mut rest = text.as_bytes();
     let mut now = 1_000_000_000;
     let mut full = 0;
@@ -253,7 +253,8 @@ fn an_unpaced_bus_carries_no_more_than_its_rate() {
     let mut bus = VirtualBus::new(Settings { max_rate: 1000, ..settings(false) });
     let mut tap = Seen::default();
     let a = socketcand_client(&mut bus, &mut tap);
-    let text: String = (0..4000).map(|i| format!("< send 001 2 {:x} {:x} >", i / 256, i % 256)).collect();
+    let text =
+        (0..4000).map(|i| format!("< send 001 2 {:x} {:x} >", i / 256, i % 256)).collect::<Vec<_>>().concat();
     let mut rest = text.as_bytes();
     let start = 1_000_000_000;
     let mut now = start;

@@ -373,12 +373,13 @@ pub struct DebugMap {
 }
 
 impl DebugMap {
-    /// The symbol with this path, without regard to case; a unique suffix (`x` for `prg.x`) is enough.
+    /// The symbol with this path, without regard to case; a suffix is enough (`x` for `prg.x`) if it is unique
+    /// among the symbols with the fewest parts, so `x` is the program's `x` even where a block in it has one too.
     pub fn symbol(&self, path: &str) -> Option<&Symbol> {
         if let Some(found) = self.symbols.iter().find(|s| s.path.eq_ignore_ascii_case(path)) {
             return Some(found);
         }
-        let mut matches = self.symbols.iter().filter(|s| {
+        let matches = |s: &&Symbol| {
             let tail = s.path.len().checked_sub(path.len()).and_then(|at| at.checked_sub(1).map(|dot| (dot, at)));
             tail.is_some_and(|(dot, at)| {
                 s.path.is_char_boundary(dot)
@@ -386,9 +387,12 @@ impl DebugMap {
                     && s.path.as_bytes()[dot] == b'.'
                     && s.path[at..].eq_ignore_ascii_case(path)
             })
-        });
-        let first = matches.next()?;
-        matches.next().is_none().then_some(first)
+        };
+        let parts = |s: &&Symbol| s.path.matches('.').count();
+        let fewest = self.symbols.iter().filter(matches).map(|s| parts(&s)).min()?;
+        let mut found = self.symbols.iter().filter(matches).filter(|s| parts(s) == fewest);
+        let first = found.next()?;
+        found.next().is_none().then_some(first)
     }
 
     /// The instance whose bytes contain this address; the innermost one.

@@ -10,6 +10,13 @@
 pub mod artifact;
 
 mod address;
+pub mod analyze;
+pub mod codes;
+pub mod ir;
+pub mod lexer;
+pub mod syntax;
+pub mod types;
+pub mod wasm;
 mod container;
 mod diagnostic;
 pub mod limits;
@@ -117,7 +124,46 @@ impl Compiled {
 ///
 /// On failure: all errors and warnings found. Never panics, whatever the text.
 pub fn compile(sources: &[Source], options: &Options) -> Result<Compiled, Diagnostics> {
-    let _ = options;
-    let items = vec![Diagnostic::placeless("E0901", "the compiler cannot compile anything yet")];
-    Err(Diagnostics::new(sources, items))
+    if let Err(d) = check_sources(sources) {
+        return Err(Diagnostics::new(sources, vec![d]));
+    }
+    let mut statements = syntax::StatementTable::default();
+    let mut units = Vec::with_capacity(sources.len() + 1);
+    let mut diags = Vec::new();
+    for (i, s) in sources.iter().enumerate() {
+        let (unit, mut found) = syntax::parse(i as u32, &s.text, &mut statements);
+        units.push(unit);
+        diags.append(&mut found);
+    }
+    let library = units.len();
+    let (unit, mut found) = syntax::parse_library(library as u32, &mut statements);
+    units.push(unit);
+    diags.append(&mut found);
+    let (analyzed, mut found) = analyze::analyze(&units, library, options, !diags.is_empty());
+    diags.append(&mut found);
+    if let (Some(a), true) = (analyzed, diags.iter().all(|d| d.severity == Severity::Warning)) {
+        match wasm::emit(&a, &statements.spans, sources, options) {
+            Ok(artifact) => {
+                let warnings = Diagnostics::new(sources, diags).items().to_vec();
+                return Ok(Compiled { artifact, warnings });
+            }
+            Err(d) => diags.push(d),
+        }
+    }
+    Err(Diagnostics::new(sources, diags))
+}
+
+fn check_sources(sources: &[Source]) -> Result<(), Diagnostic> {
+    if sources.is_empty() || sources.len() > limits::SOURCES {
+        let d = Diagnostic::placeless("E0807", format!("{} source files given", sources.len()));
+        return Err(d.help(format!("give 1 to {} files", limits::SOURCES)));
+    }
+    match sources.iter().find(|s| s.text.len() > limits::SOURCE_BYTES) {
+        Some(s) => Err(Diagnostic::placeless(
+            "E0807",
+            format!("{}: file of {} bytes, at most {} are allowed", s.name, s.text.len(), limits::SOURCE_BYTES),
+        )
+        .help("split the program into several files")),
+        None => Ok(()),
+    }
 }

@@ -14,7 +14,9 @@ pub const COMMENT_NESTING: u32 = 64;
 pub const IDENT_CHARS: usize = 128;
 /// Statements of all sources together.
 pub const STATEMENTS: usize = 500_000;
-/// Operands of one chained expression (`a + b + c ...`) and parameters of one call.
+/// Operators of one expression, parentheses and arguments included.
+pub const OPERATORS: usize = 1000;
+/// Parameters of one call, values of one enumeration.
 pub const CHAIN: usize = 4096;
 /// Variables of one POU.
 pub const VARIABLES: usize = 16_384;

@@ -164,40 +164,15 @@ fn execute(
     out: &mut [u8; MAX_PDU],
 ) -> Result<usize, Exception> {
     let response = match *request {
-        Request::ReadCoils { address, quantity } => {
-            return read_bits(function::READ_COILS, Table::Coils, address, quantity, image, out);
-        }
+        Request::ReadCoils { address, quantity } => return read(Table::Coils, address, quantity, image, out),
         Request::ReadDiscreteInputs { address, quantity } => {
-            return read_bits(
-                function::READ_DISCRETE_INPUTS,
-                Table::DiscreteInputs,
-                address,
-                quantity,
-                image,
-                out,
-            );
+            return read(Table::DiscreteInputs, address, quantity, image, out);
         }
         Request::ReadHoldingRegisters { address, quantity } => {
-            check_read(Table::HoldingRegisters, address, quantity, image)?;
-            return read_words(
-                function::READ_HOLDING_REGISTERS,
-                Table::HoldingRegisters,
-                address,
-                quantity,
-                image,
-                out,
-            );
+            return read(Table::HoldingRegisters, address, quantity, image, out);
         }
         Request::ReadInputRegisters { address, quantity } => {
-            check_read(Table::InputRegisters, address, quantity, image)?;
-            return read_words(
-                function::READ_INPUT_REGISTERS,
-                Table::InputRegisters,
-                address,
-                quantity,
-                image,
-                out,
-            );
+            return read(Table::InputRegisters, address, quantity, image, out);
         }
         Request::WriteSingleCoil { address, on } => {
             write(
@@ -247,11 +222,6 @@ fn execute(
     encode_response(&response, out).map_err(too_long)
 }
 
-fn check_read(table: Table, address: u16, quantity: u16, image: &mut dyn Image) -> Result<(), Exception> {
-    image.check(Access::Read, table, address, quantity)?;
-    image.ready(Access::Read)
-}
-
 fn write(
     table: Table,
     address: u16,
@@ -264,15 +234,24 @@ fn write(
     image.write(write)
 }
 
-fn read_bits(
-    function: u8,
+fn read(
     table: Table,
     address: u16,
     quantity: u16,
     image: &mut dyn Image,
     out: &mut [u8; MAX_PDU],
 ) -> Result<usize, Exception> {
-    check_read(table, address, quantity, image)?;
+    image.check(Access::Read, table, address, quantity)?;
+    image.ready(Access::Read)?;
+    let function = match table {
+        Table::Coils => function::READ_COILS,
+        Table::DiscreteInputs => function::READ_DISCRETE_INPUTS,
+        Table::HoldingRegisters => function::READ_HOLDING_REGISTERS,
+        Table::InputRegisters => function::READ_INPUT_REGISTERS,
+    };
+    if !table.is_bits() {
+        return read_words(function, table, address, quantity, image, out);
+    }
     let body = open_reply(function, bytes_for_bits(quantity), out)?;
     image.read_bits(table, address, quantity, body)?;
     Ok(2 + body.len())

@@ -19,6 +19,7 @@ use ipc_types::port::{Publisher, ReadCounters, SendError, Subscriber};
 use ipc_types::rail::RailError;
 use ipc_types::stack::ServiceEntry;
 use ipc_types::topic::TopicKind;
+use ipc_types::units::{Size, Span};
 use ipc_types::wiring::{Area, ImageRange, Listener, Neighbours, OnBad, TopicDecl};
 use ipc_types::{Context, Finding, Stack, Wiring, clock};
 use serde::Serialize;
@@ -149,7 +150,8 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
     let mut findings = Vec::new();
     check_plc(service, config, stack, &mut findings);
     check_tcp(service, config, &mut findings);
-    if let Err(error) = config.map.build(AreaSizes::MAX, config.addressing) {
+    let sizes = chosen_plc(config, stack).map_or(AreaSizes::MAX, |plc| plc_areas(&plc.config));
+    if let Err(error) = config.map.build(sizes, config.addressing) {
         let help = "see the page on the Modbus server for what a [[service.map]] table takes";
         findings.push(Finding::error(service, &map_key(&error), error.to_string(), help));
     }
@@ -164,15 +166,44 @@ fn map_key(error: &MapError) -> String {
     }
 }
 
+fn chosen_plc<'a>(config: &Config, stack: &'a Stack) -> Option<&'a ServiceEntry> {
+    let mut plcs = stack.services.iter().filter(|entry| entry.kind == "plc");
+    match &config.plc {
+        Some(name) => plcs.find(|entry| entry.name == *name),
+        None => plcs.next().filter(|_| plcs.next().is_none()),
+    }
+}
+
+/// Sizes of a plc service's areas, from its table of the stack file.
+pub fn plc_areas(config: &serde_json::Value) -> AreaSizes {
+    let size = |key: &str, default: u32| {
+        let value = config.get(key).and_then(|value| serde_json::from_value::<Size>(value.clone()).ok());
+        value.map_or(default, |size| size.0.min(65536) as u32)
+    };
+    let default = AreaSizes::default();
+    AreaSizes {
+        input: size("input_bytes", default.input),
+        output: size("output_bytes", default.output),
+        marker: size("marker_bytes", default.marker),
+    }
+}
+
+/// The shortest `stale_after` that a healthy plc never reaches: three times the longest time between two scans, and
+/// never more than twice the 100 ms after which every plc repeats its image.
+fn shortest_stale_after(plc: &serde_json::Value) -> Span {
+    let span = |key: &str, default_ms| {
+        let value = plc.get(key).and_then(|value| serde_json::from_value::<Span>(value.clone()).ok());
+        value.unwrap_or(Span::from_ms(default_ms))
+    };
+    let on_inputs = plc.get("trigger").is_some_and(|trigger| trigger == "inputs");
+    let period = if on_inputs { span("max_interval", 100) } else { span("cycle", 10) };
+    Span(period.ns().saturating_mul(3)).min(Span::from_ms(200))
+}
+
 fn check_plc(service: &str, config: &Config, stack: &Stack, findings: &mut Vec<Finding>) {
     let plcs: Vec<&str> =
         stack.services.iter().filter(|s| s.kind == "plc").map(|s| s.name.as_str()).collect();
-    let chosen = match &config.plc {
-        Some(name) => stack.service(name).filter(|s| s.kind == "plc"),
-        None if plcs.len() == 1 => stack.services.iter().find(|s| s.kind == "plc"),
-        None => None,
-    };
-    let Some(plc) = chosen else {
+    let Some(plc) = chosen_plc(config, stack) else {
         let message = match &config.plc {
             Some(name) => format!("there is no plc service '{name}'"),
             None if plcs.is_empty() => "the stack has no plc service whose image could be served".to_owned(),
@@ -195,23 +226,26 @@ fn check_plc(service: &str, config: &Config, stack: &Stack, findings: &mut Vec<F
             format!("set addressing = {of_plc} here too"),
         ));
     }
-    if config.stale_after.ns() == 0 {
-        let message = "stale_after is 0, so every image would be too old";
+    let shortest = shortest_stale_after(&plc.config);
+    if config.stale_after < shortest {
         findings.push(Finding::error(
             service,
             "stale_after",
-            message,
-            "leave it out (200ms) or set a longer time",
+            format!(
+                "stale_after = {} is shorter than 3 times the longest time between two scans of '{}'",
+                config.stale_after, plc.name
+            ),
+            format!("leave it out (200ms) or set at least \"{shortest}\""),
         ));
-    } else if config.stale_after.ns() < 50_000_000 {
+    } else if config.stale_after < Span::from_ms(50) {
         findings.push(Finding::warning(
             service,
             "stale_after",
             format!(
-                "stale_after = {} is short: a PLC process delayed by the system looks dead",
+                "stale_after = {} is short: a plc process delayed by the system looks dead",
                 config.stale_after
             ),
-            "200ms is the default; give at least 3 times the longest time between two scans",
+            "200ms is the default",
         ));
     }
 }

@@ -92,7 +92,9 @@ fn owned_inputs_are_declared_with_room_for_their_message() {
 #[test]
 fn a_good_table_has_no_findings() {
     let good = config(r#"{ "tcp": { "address": "127.0.0.1" } }"#);
-    assert_eq!(check_it(&good, &stack(&[("plc", "{}")])), []);
+    for plc in ["{}", r#"{ "cycle": "1s" }"#, r#"{ "trigger": "inputs", "max_interval": "1s" }"#] {
+        assert_eq!(check_it(&good, &stack(&[("plc", plc)])), [], "{plc}");
+    }
 }
 
 #[test]
@@ -111,7 +113,14 @@ fn findings_name_key_mistake_and_remedy() {
         (&format!(r#"{{ {local}, "plc": "c" }}"#), &[("a", "{}"), ("b", "{}")]),
         (&format!("{{ {local} }}"), &[("plc", r#"{ "addressing": "byte" }"#)]),
         (&format!(r#"{{ {local}, "stale_after": "0" }}"#), &one),
-        (&format!(r#"{{ {local}, "stale_after": "10ms" }}"#), &one),
+        (&format!(r#"{{ {local}, "stale_after": "10ms" }}"#), &[("plc", r#"{ "cycle": "1ms" }"#)]),
+        (&format!(r#"{{ {local}, "stale_after": "199ms" }}"#), &[("plc", r#"{ "trigger": "inputs" }"#)]),
+        (
+            &format!(
+                r#"{{ {local}, "map": [ {{ "table": "holding", "at": 0, "count": 9, "area": "%MW0" }} ] }}"#
+            ),
+            &[("plc", r#"{ "marker_bytes": "16B" }"#)],
+        ),
         (&format!(r#"{{ {local}, "units": [] }}"#), &one),
         (
             &format!(
@@ -144,8 +153,10 @@ Error plc: the stack has no plc service whose image could be served -> add a [[s
 Error plc: the stack has 2 plc services; which one is served? -> set plc to one of: a, b
 Error plc: there is no plc service 'c' -> set plc to one of: a, b
 Error addressing: %-addresses count differently here than in 'plc' ("byte") -> set addressing = "byte" here too
-Error stale_after: stale_after is 0, so every image would be too old -> leave it out (200ms) or set a longer time
-Warning stale_after: stale_after = 10ms is short: a PLC process delayed by the system looks dead -> 200ms is the default; give at least 3 times the longest time between two scans
+Error stale_after: stale_after = 0ns is shorter than 3 times the longest time between two scans of 'plc' -> leave it out (200ms) or set at least "30ms"
+Warning stale_after: stale_after = 10ms is short: a plc process delayed by the system looks dead -> 200ms is the default
+Error stale_after: stale_after = 199ms is shorter than 3 times the longest time between two scans of 'plc' -> leave it out (200ms) or set at least "200ms"
+Error map[0]: map table 1: holding_registers 0 to 8 reaches byte 18 of %M, which has 16; lower count or raise the size of %M in the plc service -> see the page on the Modbus server for what a [[service.map]] table takes
 Warning units: only units 0 and 255 are served -> leave units out to serve all, or list unit identifiers
 Error map[0]: map table 1: coils shows single bits, so area must be %QX... or %QB...; got %QW0 -> see the page on the Modbus server for what a [[service.map]] table takes
 Error write_watchdog: the watchdog has nothing to write -> add watchdog_values = [ { to = "%QW0", value = 0 } ]

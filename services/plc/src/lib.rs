@@ -1,1 +1,21 @@
-//! PLC scan engine, process image and routes
+//! The PLC service of dinrail: scan engine, process image, routes; and the verifier and tracer on the same engine.
+//!
+//! - [`engine`]: one scan after the other, sans-I/O. [`setup`] and [`routes`] are what it depends on beside its program.
+//! - [`verify`]: a recording is computed again, scan by scan. [`trace`]: a program in virtual time.
+//! - `service`: the rail, the clock and the commands around the engine; [`config`] its table of the stack file.
+//!
+//! What may never happen here: a scan that depends on anything its record does not hold, an output before the
+//! first finished scan, a program that takes the process down.
+
+pub mod engine;
+pub mod retain;
+pub mod routes;
+pub mod setup;
+pub mod config;
+pub mod program;
+pub mod service;
+
+pub use config::Config;
+pub use service::{KIND, RunError, check, run, topics};
+pub mod verify;
+pub mod trace;

@@ -176,7 +176,9 @@ mod tests {
     fn messages_come_in_time_order_and_late_ones_wait() {
         let mut batch = Batch::new(2, 100);
         let mut next = Batch::new(2, 100);
-        for (topic, seq, t) in [(0, 1, 10), (0, 2, 30), (0, 3, 5), (0, 4, 70), (0, 5, 60), (1, 1, 20), (1, 2, 65)] {
+        for (topic, seq, t) in
+            [(0, 1, 10), (0, 2, 30), (0, 3, 5), (0, 4, 70), (0, 5, 60), (1, 1, 20), (1, 2, 65)]
+        {
             assert!(batch.push(topic, &stamp(seq, t), &[topic as u8, seq as u8], b"tail"));
         }
         batch.carry(0, 62, &mut next);

@@ -211,7 +211,12 @@ fn space(config: &Config, stack: &Stack, dir: &Path, free: u64, me: &str, findin
         findings.push(Finding::error(
             me,
             "min_free",
-            format!("{} has {} free, less than min_free = {}", dir.display(), disk::human(free), config.min_free),
+            format!(
+                "{} has {} free, less than min_free = {}",
+                dir.display(),
+                disk::human(free),
+                config.min_free
+            ),
             "free space on that file system, choose another 'dir', or lower 'min_free'",
         ));
         return;
@@ -254,7 +259,8 @@ mod tests {
     #[test]
     fn every_mistake_names_its_key() {
         let dir = crate::testing::TempDir::new("config");
-        let mut stack = stack_of("check", dir.path(), &[("can0", TopicKind::CanRx), ("plc", TopicKind::Scan)]);
+        let mut stack =
+            stack_of("check", dir.path(), &[("can0", TopicKind::CanRx), ("plc", TopicKind::Scan)]);
         let me = entry("rec", "recorder", 7);
         let good = Config { keep: Size(200 << 20), ..Config::default() };
         assert_eq!(check(&good, &stack, &me), vec![]);

@@ -40,7 +40,9 @@ fn listed(dir: &Path, stack: &str, ending: &str) -> Vec<Found> {
     let mut found = Vec::new();
     for item in folder.flatten() {
         let name = item.file_name();
-        let Some((time, n)) = name.to_str().and_then(|name| parse_name(stack, name, ending)) else { continue };
+        let Some((time, n)) = name.to_str().and_then(|name| parse_name(stack, name, ending)) else {
+            continue;
+        };
         let Ok(meta) = item.metadata() else { continue };
         if meta.is_file() {
             found.push(((time.to_owned(), n), Found { path: item.path(), bytes: meta.len() }));
@@ -53,6 +55,19 @@ fn listed(dir: &Path, stack: &str, ending: &str) -> Vec<Found> {
 /// This stack's recordings in the folder, oldest first.
 pub fn recordings(dir: &Path, stack: &str) -> Vec<Found> {
     listed(dir, stack, ENDING)
+}
+
+/// Every `.mcap` file of the folder, of any stack and making, by name.
+pub fn all_recordings(dir: &Path) -> io::Result<Vec<Found>> {
+    let mut found = Vec::new();
+    for item in std::fs::read_dir(dir)?.flatten() {
+        let meta = item.metadata();
+        if item.path().extension().is_some_and(|e| e == "mcap") && meta.as_ref().is_ok_and(|m| m.is_file()) {
+            found.push(Found { path: item.path(), bytes: meta.map_or(0, |m| m.len()) });
+        }
+    }
+    found.sort_by(|a, b| a.path.cmp(&b.path));
+    Ok(found)
 }
 
 /// Removes half-made copies of a sealing that was killed.
@@ -133,7 +148,8 @@ pub fn free_bytes(dir: &Path) -> Option<u64> {
 
 /// Whether files can be made in the folder, or the folder itself. Leaves nothing behind.
 pub fn writable(dir: &Path) -> io::Result<()> {
-    let not = |path: &Path, cause: String| io::Error::other(format!("cannot write {}: {cause}", path.display()));
+    let not =
+        |path: &Path, cause: String| io::Error::other(format!("cannot write {}: {cause}", path.display()));
     let Some(existing) = dir.ancestors().find(|d| d.exists()) else {
         return Err(not(dir, "no folder above it exists".into()));
     };
@@ -211,6 +227,7 @@ mod tests {
         let gone: Vec<_> = deleted.iter().map(|f| f.path.file_name().unwrap().to_str().unwrap()).collect();
         assert_eq!(gone, [&names[0], &names[3], &names[4]]);
         assert!(stranger.exists());
+        assert_eq!(all_recordings(dir.path()).unwrap().len(), 12 + 1 - 3);
         // Nothing but protected files is left at last; the current one stays even above the quota.
         enforce_quota(dir.path(), "s", 0, Some(&current));
         let left: Vec<_> = recordings(dir.path(), "s").into_iter().map(|f| f.path).collect();

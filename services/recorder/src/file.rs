@@ -7,7 +7,7 @@
 
 use crate::config::Compression;
 use crate::sink::Sink;
-use mcap::records::{Metadata, MessageHeader};
+use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, McapError, McapResult, WriteOptions, Writer};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -90,7 +90,8 @@ impl RecordingFile {
     /// Adds a channel; its number. Call [`Self::close_chunk`] after the last one: raw messages need their
     /// channel before them.
     pub fn add_channel(&mut self, spec: &ChannelSpec) -> McapResult<u16> {
-        let schema = self.writer.add_schema(&spec.schema_name, &spec.schema_encoding, spec.schema.as_bytes())?;
+        let schema =
+            self.writer.add_schema(&spec.schema_name, &spec.schema_encoding, spec.schema.as_bytes())?;
         self.writer.add_channel(schema, &spec.topic, &spec.message_encoding, &spec.metadata)
     }
 
@@ -202,5 +203,74 @@ impl RecordingFile {
     /// Gives the file up after an error: no index, what stands stays.
     pub fn abandon(self) {
         drop(self.writer.into_inner());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::format::gaps_channel;
+
+    fn head(channel_id: u16, sequence: u32) -> MessageHeader {
+        MessageHeader { channel_id, sequence, log_time: 7, publish_time: 7 }
+    }
+
+    #[test]
+    fn a_full_disk_is_an_error_and_no_panic() {
+        let full = Arc::new(File::options().read(true).write(true).open("/dev/full").unwrap());
+        let now = Instant::now();
+        for step in 0..3 {
+            let mut file = RecordingFile::new(full.clone(), Compression::Zstd, true).unwrap();
+            let channel = file.add_channel(&gaps_channel()).unwrap();
+            file.message(&head(channel, 1), b"{}", now).unwrap();
+            let error = match step {
+                0 => file.flush(now).unwrap_err(),
+                1 => file.close_chunk().unwrap_err(),
+                _ => file.metadata("name", BTreeMap::new()).unwrap_err(),
+            };
+            let McapError::Io(error) = error else { panic!("{error}") };
+            assert_eq!(error.raw_os_error(), Some(libc::ENOSPC));
+            // What is done with it afterwards may fail, but must not panic.
+            let _ = file.message(&head(channel, 2), b"{}", now);
+            if step == 0 {
+                file.abandon()
+            } else {
+                file.finish().unwrap_err();
+            }
+        }
+    }
+
+    #[test]
+    fn the_chunk_takes_the_place_of_its_raw_messages() {
+        let dir = crate::testing::TempDir::new("file");
+        let path = dir.path().join("a.mcap");
+        let handle = File::options().read(true).write(true).create_new(true).open(&path).unwrap();
+        let mut file = RecordingFile::new(Arc::new(handle), Compression::Zstd, true).unwrap();
+        let channel = file.add_channel(&gaps_channel()).unwrap();
+        file.close_chunk().unwrap();
+        let (empty, start) = (file.bytes(), Instant::now());
+        let messages = |path: &std::path::Path| {
+            let messages = crate::Recording::open(path).unwrap().messages();
+            messages.map(|m| m.unwrap().tail).collect::<Vec<_>>()
+        };
+        for n in 1..=100u32 {
+            file.message(&head(channel, n), &[b' '; 100], start).unwrap();
+            file.flush(start).unwrap();
+            assert_eq!(messages(&path).len() as u32, n, "in the file after each flush");
+        }
+        let (raw, before) = (file.bytes(), std::fs::read(&path).unwrap());
+        assert_eq!(raw - empty, 100 * (MESSAGE_HEAD as u64 + 100));
+        file.flush(start + CHUNK_AGE).unwrap();
+        assert!(file.bytes() < raw, "the chunk is smaller than its raw messages");
+        assert_eq!(file.bytes(), std::fs::metadata(&path).unwrap().len());
+        assert_eq!(messages(&path), vec![vec![b' '; 100]; 100]);
+        // Killed after the chunk was written and before the rest of the raw messages was cut off.
+        let mut torn = std::fs::read(&path).unwrap();
+        torn.extend_from_slice(&before[torn.len()..]);
+        let read = crate::Recording::from_bytes(&path, torn).unwrap().messages();
+        assert_eq!(read.filter(|m| m.is_ok()).count(), 100);
+        file.finish().unwrap();
+        assert_eq!(messages(&path).len(), 100);
+        assert!(crate::disk::is_finished(&path));
     }
 }

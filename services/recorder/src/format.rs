@@ -21,6 +21,8 @@ pub const META_RECORDING: &str = "dinrail.recording";
 pub const META_CLOCK: &str = "dinrail.clock";
 /// Metadata record of a file that [`crate::seal`] made whole.
 pub const META_SEALED: &str = "dinrail.sealed";
+/// Attachment with the text of the stack file.
+pub const STACK_TEXT: &str = "stack.toml";
 /// Attachment with the resolved stack.
 pub const RESOLVED_STACK: &str = "stack.json";
 /// Channel metadata key with the [`ipc_types::topic::TopicKind`].
@@ -43,7 +45,10 @@ pub fn recorded_topics<'a>(stack: &'a Stack, exclude: &[String]) -> Vec<&'a Topi
 /// of package and type, so the version stands in the package.
 pub fn schema_name(payload: &str) -> String {
     let named = payload.split_once('.').and_then(|(package, rest)| Some((package, rest.split_once('/')?)));
-    named.map_or_else(|| payload.to_owned(), |(package, (name, version))| format!("{package}_v{version}/{name}"))
+    named.map_or_else(
+        || payload.to_owned(),
+        |(package, (name, version))| format!("{package}_v{version}/{name}"),
+    )
 }
 
 /// The channel of a topic.
@@ -131,7 +136,12 @@ pub fn host_name() -> String {
 }
 
 /// Entries of [`META_RECORDING`].
-pub fn recording_metadata(stack: &Stack, recorder: &str, generation: u32, n: u32) -> BTreeMap<String, String> {
+pub fn recording_metadata(
+    stack: &Stack,
+    recorder: &str,
+    generation: u32,
+    n: u32,
+) -> BTreeMap<String, String> {
     let stack_hash = xxhash_rust::xxh3::xxh3_64(stack.text.as_bytes());
     BTreeMap::from([
         ("stack".to_owned(), stack.name.clone()),
@@ -253,7 +263,10 @@ mod tests {
         assert_eq!(frames.schema, TopicKind::CanRx.ros1msg());
         assert_eq!(frames.metadata["kind"], "can_rx");
         let events = channel(recorded[5]);
-        assert_eq!((events.message_encoding.as_str(), events.schema_name.as_str()), ("json", "dinrail_v1/Event"));
+        assert_eq!(
+            (events.message_encoding.as_str(), events.schema_name.as_str()),
+            ("json", "dinrail_v1/Event")
+        );
         assert_eq!(frames.schema_name, "dinrail_v1/CanFrame");
         assert_eq!(frames.metadata["payload"], "dinrail.CanFrame/1");
     }
@@ -264,8 +277,11 @@ mod tests {
         std::fs::write(dir.path().join("main.st"), "A").unwrap();
         let mut stack = stack_of("files", dir.path(), &[]);
         let mut plc = crate::testing::entry("plc", "plc", 1);
-        plc.wiring.files =
-            vec![("main.st".into(), "program[0]".into()), ("gone.eds".into(), "eds".into()), ("main.st".into(), "x".into())];
+        plc.wiring.files = vec![
+            ("main.st".into(), "program[0]".into()),
+            ("gone.eds".into(), "eds".into()),
+            ("main.st".into(), "x".into()),
+        ];
         stack.services.push(plc);
         let mut files = attached_files(&stack);
         assert_eq!(files.len(), 2);

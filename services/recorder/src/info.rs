@@ -174,7 +174,8 @@ fn sum_up(info: &mut Info, recording: &Recording, counts: &BTreeMap<u16, Count>)
             missed,
         });
         if count.messages > 0 {
-            info.first_ns = if info.messages == 0 { count.first_ns } else { info.first_ns.min(count.first_ns) };
+            info.first_ns =
+                if info.messages == 0 { count.first_ns } else { info.first_ns.min(count.first_ns) };
             info.last_ns = info.last_ns.max(count.last_ns);
             info.messages += count.messages;
         }
@@ -189,7 +190,14 @@ impl fmt::Display for Info {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let of = |key: &str| self.recording.get(key).map_or("-", String::as_str);
         writeln!(f, "{}", self.path.display())?;
-        writeln!(f, "  stack      {} ({}), build {}, host {}", of("stack"), of("stack_file"), of("build"), of("host"))?;
+        writeln!(
+            f,
+            "  stack      {} ({}), build {}, host {}",
+            of("stack"),
+            of("stack_file"),
+            of("build"),
+            of("host")
+        )?;
         writeln!(f, "  state      {}", self.state())?;
         if let Some(sealed) = &self.sealed {
             let lost = sealed.get("bytes_lost").map_or("?", String::as_str);
@@ -208,14 +216,23 @@ impl fmt::Display for Info {
             writeln!(f, "  recorder   {}{}", gaps.text, if gaps.last { "" } else { " so far" })?;
         }
         if !self.attachments.is_empty() {
-            let files: Vec<_> = self.attachments.iter().map(|a| format!("{} ({})", a.name, human(a.bytes))).collect();
+            let files: Vec<_> =
+                self.attachments.iter().map(|a| format!("{} ({})", a.name, human(a.bytes))).collect();
             writeln!(f, "  files      {}", files.join(", "))?;
         }
         for damage in &self.end.damages {
-            writeln!(f, "  damage     at byte {}: {} ({} bytes left out)", damage.offset, damage.reason, damage.bytes)?;
+            writeln!(
+                f,
+                "  damage     at byte {}: {} ({} bytes left out)",
+                damage.offset, damage.reason, damage.bytes
+            )?;
         }
         let width = self.channels.iter().map(|c| c.topic.len()).max().unwrap_or(0).max(5);
-        writeln!(f, "  {:width$} {:>10} {:>12} {:>10} {:>8} {:>8}  schema", "topic", "messages", "bytes", "per s", "gaps", "missed")?;
+        writeln!(
+            f,
+            "  {:width$} {:>10} {:>12} {:>10} {:>8} {:>8}  schema",
+            "topic", "messages", "bytes", "per s", "gaps", "missed"
+        )?;
         for c in &self.channels {
             let gaps = c.gaps.map_or("-".to_owned(), |g| g.to_string());
             writeln!(
@@ -238,6 +255,8 @@ impl Info {
             return format!("finished, but {} damaged parts are left out", self.end.damaged);
         }
         let (at, unread) = (self.end.offset, self.end.unread);
-        format!("unfinished: {reason} (byte {at}, {unread} bytes unread); `dinrail recordings recover` makes it whole")
+        format!(
+            "unfinished: {reason} (byte {at}, {unread} bytes unread); `dinrail recordings recover` makes it whole"
+        )
     }
 }

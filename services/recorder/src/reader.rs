@@ -5,13 +5,16 @@
 //! handed over, and [`Recording::end`] says where and why it ended. A chunk that fails its checksum is left
 //! out, counted, and reading goes on behind it.
 
-use crate::format::{KIND_KEY, META_CLOCK, PAYLOAD_KEY};
+use crate::format::META_CLOCK;
+pub use crate::item::{Attachment, Channel, Damage, End, Item, Message, Metadata, OwnedMessage};
+use crate::record::{
+    Bytes, Schema, attachment, chunk_head, crc32, kind_of, metadata, op, schema, stamp_of, tail_len,
+};
 use ipc_types::payload::{Encoding, Stamp};
-use ipc_types::topic::TopicKind;
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{self, BufReader, Read, Seek, SeekFrom};
+use std::io::{self, BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 /// Largest chunk, compressed or not.
@@ -25,20 +28,6 @@ pub const MAX_SCHEMA_BYTES: usize = 16 << 20;
 /// Damages that are remembered one by one; the rest is only counted.
 pub const MAX_DAMAGES: usize = 16;
 
-mod op {
-    pub const HEADER: u8 = 0x01;
-    pub const SCHEMA: u8 = 0x03;
-    pub const CHANNEL: u8 = 0x04;
-    pub const MESSAGE: u8 = 0x05;
-    pub const CHUNK: u8 = 0x06;
-    pub const ATTACHMENT: u8 = 0x09;
-    pub const METADATA: u8 = 0x0C;
-    pub const DATA_END: u8 = 0x0F;
-    /// Last opcode that MCAP assigns; from 0x80 on they are private.
-    pub const LAST: u8 = 0x0F;
-    pub const PRIVATE: u8 = 0x80;
-}
-
 /// Why a file cannot be read at all.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadError {
@@ -50,104 +39,6 @@ pub enum ReadError {
     Io { path: PathBuf, offset: u64, source: io::Error },
 }
 
-/// A stream of messages.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Channel {
-    pub id: u16,
-    pub topic: String,
-    /// What it is on the rail; `None` for channels that are not of this version's topics.
-    pub kind: Option<TopicKind>,
-    pub message_encoding: String,
-    pub schema_id: u16,
-    pub schema_name: String,
-    pub schema_encoding: String,
-    pub schema: Vec<u8>,
-    pub metadata: BTreeMap<String, String>,
-}
-
-/// A message, borrowed from the reader.
-#[derive(Debug, Clone, Copy)]
-pub struct Message<'a> {
-    pub channel: &'a Channel,
-    /// Who, when, which. Of JSON messages only `seq` (low 32 bits) and `t_ns` are known.
-    pub stamp: Stamp,
-    /// Header bytes as in shared memory; empty for JSON and unknown kinds.
-    pub header: &'a [u8],
-    /// Tail bytes, or the JSON text, or all bytes of an unknown kind.
-    pub tail: &'a [u8],
-    /// Header and tail in one piece.
-    pub data: &'a [u8],
-    pub sequence: u32,
-    /// UTC in ns.
-    pub log_time: u64,
-    pub publish_time: u64,
-}
-
-impl Message<'_> {
-    /// Name of the topic.
-    pub fn topic(&self) -> &str {
-        &self.channel.topic
-    }
-}
-
-/// A file within the recording, borrowed from the reader.
-#[derive(Debug, Clone, Copy)]
-pub struct Attachment<'a> {
-    pub name: &'a str,
-    pub media_type: &'a str,
-    pub log_time: u64,
-    pub create_time: u64,
-    pub data: &'a [u8],
-}
-
-/// A metadata record.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Metadata {
-    pub name: String,
-    pub entries: BTreeMap<String, String>,
-}
-
-/// What the reader hands over, in the order of the file.
-#[derive(Debug)]
-pub enum Item<'a> {
-    Message(Message<'a>),
-    Attachment(Attachment<'a>),
-    Metadata(Metadata),
-}
-
-/// A part of the file that was left out.
-#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
-pub struct Damage {
-    /// Where the damaged record begins.
-    pub offset: u64,
-    pub bytes: u64,
-    pub reason: String,
-}
-
-/// How a file ended.
-#[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize)]
-pub struct End {
-    /// Data, index and end are all there.
-    pub finished: bool,
-    /// First byte that was not used.
-    pub offset: u64,
-    /// Bytes of data from there on that were not understood; 0 when the file ends between two records.
-    pub unread: u64,
-    /// Why reading ended, if not with the end of the data.
-    pub reason: Option<String>,
-    /// Chunks and records left out.
-    pub damaged: u64,
-    pub damaged_bytes: u64,
-    /// The first [`MAX_DAMAGES`] of them.
-    pub damages: Vec<Damage>,
-}
-
-struct Schema {
-    name: String,
-    encoding: String,
-    data: Vec<u8>,
-}
-
 /// Where the next item lies.
 #[derive(Clone, Copy)]
 enum Place {
@@ -155,10 +46,14 @@ enum Place {
     Record,
 }
 
+/// Where the bytes come from.
+trait Source: Read + Seek + Send {}
+impl<T: Read + Seek + Send> Source for T {}
+
 /// A recording being read.
 pub struct Recording {
     path: PathBuf,
-    file: BufReader<File>,
+    file: BufReader<Box<dyn Source>>,
     /// Length when it was opened: a file that grows meanwhile is read up to there.
     len: u64,
     offset: u64,
@@ -186,10 +81,20 @@ impl Recording {
         if meta.is_dir() {
             return Err(opened(io::Error::new(io::ErrorKind::IsADirectory, "it is a folder")));
         }
+        Self::read(path, Box::new(file), meta.len())
+    }
+
+    /// Reads a recording in memory; errors call it `name`.
+    pub fn from_bytes(name: &Path, bytes: Vec<u8>) -> Result<Self, ReadError> {
+        let len = bytes.len() as u64;
+        Self::read(name, Box::new(Cursor::new(bytes)), len)
+    }
+
+    fn read(path: &Path, source: Box<dyn Source>, len: u64) -> Result<Self, ReadError> {
         let mut recording = Self {
             path: path.to_owned(),
-            file: BufReader::with_capacity(256 * 1024, file),
-            len: meta.len(),
+            file: BufReader::with_capacity(256 * 1024, source),
+            len,
             offset: 0,
             record: Vec::new(),
             chunk: Vec::new(),
@@ -340,7 +245,10 @@ impl Recording {
     fn record_head(&mut self) -> Result<Option<(u8, u64)>, ReadError> {
         let left = self.len - self.offset;
         if left < 9 {
-            self.stop(if left == 0 { "the file has no end yet" } else { "the file ends within a record" }, left);
+            self.stop(
+                if left == 0 { "the file has no end yet" } else { "the file ends within a record" },
+                left,
+            );
             return Ok(None);
         }
         let mut head = [0u8; 9];
@@ -348,7 +256,8 @@ impl Recording {
             return Ok(None);
         }
         self.offset -= 9;
-        let len = u64::from_le_bytes([head[1], head[2], head[3], head[4], head[5], head[6], head[7], head[8]]);
+        let len =
+            u64::from_le_bytes([head[1], head[2], head[3], head[4], head[5], head[6], head[7], head[8]]);
         let known = (1..=op::LAST).contains(&head[0]) || head[0] >= op::PRIVATE;
         if !known {
             self.stop("what follows is no MCAP record", left);
@@ -364,7 +273,8 @@ impl Recording {
     fn advance_in_chunk(&mut self) -> Option<(u8, Place)> {
         let rest = &self.chunk[self.chunk_at..];
         let bounds = rest.first_chunk::<9>().and_then(|head| {
-            let len = u64::from_le_bytes([head[1], head[2], head[3], head[4], head[5], head[6], head[7], head[8]]);
+            let len =
+                u64::from_le_bytes([head[1], head[2], head[3], head[4], head[5], head[6], head[7], head[8]]);
             let len = usize::try_from(len).ok()?;
             (len <= rest.len() - 9).then_some((head[0], len))
         });
@@ -611,17 +521,6 @@ fn new_decoder() -> LinearReader {
     )
 }
 
-/// A message that owns its bytes.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct OwnedMessage {
-    pub topic: String,
-    pub kind: Option<TopicKind>,
-    pub stamp: Stamp,
-    pub header: Vec<u8>,
-    pub tail: Vec<u8>,
-    pub log_time: u64,
-}
-
 /// Iterator over the messages of a recording.
 pub struct Messages {
     recording: Recording,
@@ -661,120 +560,4 @@ impl Iterator for Messages {
             }
         }
     }
-}
-
-/// The topic kind that channel metadata names, if its payload is the one of this version.
-fn kind_of(metadata: &BTreeMap<String, String>, encoding: &str) -> Option<TopicKind> {
-    let (name, payload) = (metadata.get(KIND_KEY)?, metadata.get(PAYLOAD_KEY)?);
-    let kind: TopicKind = serde_json::from_value(serde_json::Value::String(name.clone())).ok()?;
-    let expected = match kind.encoding() {
-        Encoding::Ros1 => "ros1",
-        Encoding::Json => "json",
-    };
-    (kind.row().payload == payload && encoding == expected).then_some(kind)
-}
-
-fn stamp_of(header: &[u8]) -> Option<Stamp> {
-    let mut bytes = Bytes(header);
-    Some(Stamp { seq: bytes.u64()?, t_ns: bytes.u64()?, generation: bytes.u32()?, writer: bytes.u32()? })
-}
-
-/// The `n` that ends a header with tail.
-fn tail_len(header: &[u8]) -> Option<usize> {
-    header.last_chunk::<4>().map(|n| u32::from_le_bytes(*n) as usize)
-}
-
-/// Bytes that may end anywhere.
-struct Bytes<'a>(&'a [u8]);
-
-impl<'a> Bytes<'a> {
-    fn take(&mut self, n: usize) -> Option<&'a [u8]> {
-        let (now, later) = self.0.split_at_checked(n)?;
-        self.0 = later;
-        Some(now)
-    }
-    fn u16(&mut self) -> Option<u16> {
-        self.take(2)?.try_into().ok().map(u16::from_le_bytes)
-    }
-    fn u32(&mut self) -> Option<u32> {
-        self.take(4)?.try_into().ok().map(u32::from_le_bytes)
-    }
-    fn u64(&mut self) -> Option<u64> {
-        self.take(8)?.try_into().ok().map(u64::from_le_bytes)
-    }
-    fn string(&mut self) -> Option<&'a str> {
-        let len = self.u32()? as usize;
-        std::str::from_utf8(self.take(len)?).ok()
-    }
-    fn map(&mut self) -> Option<BTreeMap<String, String>> {
-        let len = self.u32()? as usize;
-        let mut inner = Bytes(self.take(len)?);
-        let mut map = BTreeMap::new();
-        while !inner.0.is_empty() {
-            let (key, value) = (inner.string()?, inner.string()?);
-            map.insert(key.to_owned(), value.to_owned());
-        }
-        Some(map)
-    }
-}
-
-struct ChunkHead<'a> {
-    crc: u32,
-    compression: &'a str,
-    records: (usize, usize),
-}
-
-fn chunk_head(record: &[u8]) -> Option<ChunkHead<'_>> {
-    let mut bytes = Bytes(record);
-    let (_start, _end, uncompressed) = (bytes.u64()?, bytes.u64()?, bytes.u64()?);
-    let (crc, compression) = (bytes.u32()?, bytes.string()?);
-    let len = usize::try_from(bytes.u64()?).ok()?;
-    let from = record.len() - bytes.0.len();
-    let fits = len <= bytes.0.len() && uncompressed <= MAX_CHUNK;
-    fits.then_some(ChunkHead { crc, compression, records: (from, from + len) })
-}
-
-fn schema(record: &[u8]) -> Option<(u16, Schema)> {
-    let mut bytes = Bytes(record);
-    let id = bytes.u16()?;
-    let (name, encoding) = (bytes.string()?.to_owned(), bytes.string()?.to_owned());
-    let len = bytes.u32()? as usize;
-    let data = bytes.take(len)?.to_vec();
-    Some((id, Schema { name, encoding, data }))
-}
-
-fn attachment(record: &[u8]) -> Option<Attachment<'_>> {
-    let mut bytes = Bytes(record);
-    let (log_time, create_time) = (bytes.u64()?, bytes.u64()?);
-    let (name, media_type) = (bytes.string()?, bytes.string()?);
-    let len = usize::try_from(bytes.u64()?).ok()?;
-    let data = bytes.take(len)?;
-    let crc_from = record.len() - bytes.0.len();
-    let crc = bytes.u32()?;
-    let sound = crc == 0 || crc32(&record[..crc_from]) == crc;
-    sound.then_some(Attachment { name, media_type, log_time, create_time, data })
-}
-
-fn metadata(record: &[u8]) -> Option<Metadata> {
-    let mut bytes = Bytes(record);
-    Some(Metadata { name: bytes.string()?.to_owned(), entries: bytes.map()? })
-}
-
-/// CRC-32 of ISO-HDLC (zlib's), as MCAP uses it.
-fn crc32(bytes: &[u8]) -> u32 {
-    const TABLE: [u32; 256] = {
-        let mut table = [0u32; 256];
-        let mut i = 0;
-        while i < 256 {
-            let (mut value, mut bit) = (i as u32, 0);
-            while bit < 8 {
-                value = if value & 1 == 1 { 0xEDB8_8320 ^ (value >> 1) } else { value >> 1 };
-                bit += 1;
-            }
-            table[i] = value;
-            i += 1;
-        }
-        table
-    };
-    !bytes.iter().fold(!0u32, |crc, byte| TABLE[((crc ^ u32::from(*byte)) & 0xFF) as usize] ^ (crc >> 8))
 }

@@ -154,7 +154,10 @@ mod tests {
         let mut bytes = as_bytes(&inputs).to_vec();
         bytes.extend_from_slice(&[0xAB, 0, 1]);
         let map = Layout::parse(&TopicKind::Inputs.ros1msg()).unwrap().decode(&bytes).unwrap();
-        assert_eq!((&map["data_t_ns"], &map["ranges"], &map["data"]), (&json!(7), &json!(2), &json!("AB0001")));
+        assert_eq!(
+            (&map["data_t_ns"], &map["ranges"], &map["data"]),
+            (&json!(7), &json!(2), &json!("AB0001"))
+        );
     }
 
     #[test]

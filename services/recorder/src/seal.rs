@@ -46,7 +46,9 @@ pub enum SealError {
     Read(#[from] ReadError),
     #[error("{0} is being written by a running recorder; it will finish the file itself")]
     InUse(PathBuf),
-    #[error("cannot write {path}: {source}; free space there (about the size of the recording) and try again")]
+    #[error(
+        "cannot write {path}: {source}; free space there (about the size of the recording) and try again"
+    )]
     Write { path: PathBuf, source: io::Error },
 }
 

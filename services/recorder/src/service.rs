@@ -6,7 +6,7 @@ use crate::disk;
 use crate::format;
 use crate::writer::{Notice, Progress, Shared, ToWriter, Writer};
 use ipc_types::event::{EventKind, Level};
-use ipc_types::payload::Job;
+use ipc_types::payload::{HealthState, Job};
 use ipc_types::port::{Publisher, RawSubscriber, ReadCounters};
 use ipc_types::rail::RailError;
 use ipc_types::reactor::Reactor;
@@ -190,7 +190,8 @@ impl Recorder {
                 self.batch_since = Some(Instant::now());
             }
             self.batch = Some(batch);
-            let aged = self.batch_since.is_some_and(|at| at.elapsed() >= self.config.flush_interval.duration());
+            let aged =
+                self.batch_since.is_some_and(|at| at.elapsed() >= self.config.flush_interval.duration());
             let full = self.batch.as_ref().is_some_and(|b| b.is_full());
             if (full || aged) && !self.hand_over(first, began_ns) {
                 self.stalls += u64::from(full);
@@ -282,6 +283,10 @@ impl Recorder {
             return;
         }
         let progress = self.shared.progress.lock().map(|p| p.clone()).unwrap_or_default();
+        let was_paused = self.last.as_ref().is_some_and(|(_, p)| p.paused.is_some());
+        if progress.paused.is_some() != was_paused {
+            self.ctx.set_state(if was_paused { HealthState::Ready } else { HealthState::Degraded });
+        }
         self.status(&progress, elapsed);
         self.tell_losses(progress.dropped);
         self.follow_clock();
@@ -302,7 +307,8 @@ impl Recorder {
             .collect();
         let status = Status {
             progress,
-            messages_per_s: (progress.messages.saturating_sub(before.messages) as f64 / seconds).round() as u64,
+            messages_per_s: (progress.messages.saturating_sub(before.messages) as f64 / seconds).round()
+                as u64,
             mb_per_h: (grown / seconds * 3600.0 / 1e5).round() / 10.0,
             missed: self.missed(progress.dropped),
             losses,
@@ -359,6 +365,7 @@ impl Recorder {
 
     /// Takes what is still there and lets the writer finish.
     fn stop(mut self, finished: &Receiver<()>) -> Result<(), RunError> {
+        self.ctx.set_state(HealthState::Stopping);
         self.look();
         if let Some(batch) = self.batch.take() {
             self.send(batch);

@@ -7,7 +7,9 @@ use crate::batch::{Batch, Entry, Pool};
 use crate::config::Config;
 use crate::disk;
 use crate::file::{ChannelSpec, RecordingFile};
-use crate::format::{self, AttachedFile, Gaps, META_CLOCK, META_RECORDING, RESOLVED_STACK, TopicGaps, utc_of};
+use crate::format::{
+    self, AttachedFile, Gaps, META_CLOCK, META_RECORDING, RESOLVED_STACK, STACK_TEXT, TopicGaps, utc_of,
+};
 use crate::seal;
 use crate::sync::{Command, Syncer};
 use ipc_types::clock;
@@ -396,7 +398,8 @@ impl Writer {
         if self.retry_at.replace(Instant::now() + RETRY).is_some() {
             return;
         }
-        let free = disk::free_bytes(&self.dir).map_or_else(String::new, |f| format!(" ({} free)", disk::human(f)));
+        let free =
+            disk::free_bytes(&self.dir).map_or_else(String::new, |f| format!(" ({} free)", disk::human(f)));
         let message = format!(
             "recording stopped: cannot write {}: {cause}{free}; free space there or lower 'keep'; \
              trying again every {} s",
@@ -424,9 +427,8 @@ impl Writer {
             return self.pause(&dir, &format!("less free space than min_free = {}", self.config.min_free));
         }
         let path = self.dir.clone();
-        let made = std::fs::create_dir_all(&path).and_then(|()| {
-            disk::create(&path, &self.stack.name, clock::utc_ns(), &mut self.n)
-        });
+        let made = std::fs::create_dir_all(&path)
+            .and_then(|()| disk::create(&path, &self.stack.name, clock::utc_ns(), &mut self.n));
         let (path, file) = match made {
             Ok(made) => made,
             Err(e) => return self.pause(&path, &e.to_string()),
@@ -457,7 +459,8 @@ impl Writer {
         self.shared.keyframe_wanted.store(plcs, Ordering::Relaxed);
         if self.retry_at.take().is_some() {
             let dropped: u64 = self.topics.iter().map(|t| t.dropped).sum();
-            let message = format!("recording again, into {}; {dropped} messages were lost", open.path.display());
+            let message =
+                format!("recording again, into {}; {dropped} messages were lost", open.path.display());
             let _ = self.notices.send(Notice { fault: false, message, detail: serde_json::Value::Null });
             let broken = std::mem::take(&mut self.broken);
             self.open = Some(open);
@@ -474,8 +477,7 @@ impl Writer {
         let about = format::recording_metadata(&self.stack, &self.service, self.generation, self.n);
         mcap.metadata(META_RECORDING, about)?;
         mcap.metadata(META_CLOCK, format::clock_metadata(self.utc_offset_ns, t_ns, "start"))?;
-        let name = self.stack.file.file_name().map_or("stack.toml".into(), |n| n.to_string_lossy());
-        mcap.attach(&name, "application/toml", utc, self.stack.text.as_bytes())?;
+        mcap.attach(STACK_TEXT, "application/toml", utc, self.stack.text.as_bytes())?;
         let resolved = serde_json::to_vec_pretty(&*self.stack).unwrap_or_default();
         mcap.attach(RESOLVED_STACK, "application/json", utc, &resolved)?;
         self.attached.iter_mut().for_each(AttachedFile::forget);
@@ -521,7 +523,9 @@ impl Writer {
             self.pause(&current, &format!("less free space than min_free = {}", self.config.min_free));
         }
         // A stack without traffic rotates too.
-        let aged = |open: &Open| self.config.max_time.is_some_and(|t| now - open.since >= t.duration() + KEYFRAME_WAIT);
+        let aged = |open: &Open| {
+            self.config.max_time.is_some_and(|t| now - open.since >= t.duration() + KEYFRAME_WAIT)
+        };
         if self.open.as_ref().is_some_and(aged) {
             self.rotate();
         }

@@ -51,7 +51,9 @@ fn check_values(found: &Value) {
 #[test]
 fn every_payload_is_read_by_python_alone() {
     let Some(python) = python() else { return };
-    for (compression, index) in [(Compression::Zstd, true), (Compression::None, true), (Compression::Zstd, false)] {
+    for (compression, index) in
+        [(Compression::Zstd, true), (Compression::None, true), (Compression::Zstd, false)]
+    {
         let dir = TempDir::new("python");
         let mut rig = Rig::start(stack(dir.path()), Config { compression, index, ..Config::default() });
         let messages = one_of_each(clock::mono_ns());
@@ -71,7 +73,10 @@ fn every_payload_is_read_by_python_alone() {
         assert_eq!(found["attachments"]["stack.toml"], json!(["[stack]\nname = \"test\"\n"]));
         assert!(found["attachments"]["stack.json"][0].as_str().unwrap().contains("\"build-1\""));
         assert_eq!(found["metadata"]["dinrail.recording"][0]["build"], "build-1");
-        assert!(found["metadata"]["dinrail.clock"][0]["utc_offset_ns"].as_str().unwrap().parse::<i64>().unwrap() > 0);
+        assert!(
+            found["metadata"]["dinrail.clock"][0]["utc_offset_ns"].as_str().unwrap().parse::<i64>().unwrap()
+                > 0
+        );
     }
 }
 
@@ -84,7 +89,12 @@ fn a_file_is_read_while_it_is_written_and_after_it_was_cut_off() {
     let t = clock::mono_ns();
     // More than a chunk, so that both closed chunks and raw messages are there.
     for _ in 0..8 {
-        let frames: Vec<_> = (0..500).map(|_| { seq += 1; frame(seq, t) }).collect();
+        let frames: Vec<_> = (0..500)
+            .map(|_| {
+                seq += 1;
+                frame(seq, t)
+            })
+            .collect();
         rig.send(&frames);
     }
     rig.send(&one_of_each(t));

@@ -35,7 +35,7 @@ fn read(path: &Path) -> (Vec<OwnedMessage>, bool) {
 #[test]
 fn a_file_cut_off_at_any_byte_gives_what_stands_before_the_cut() {
     for compression in [Compression::Zstd, Compression::None] {
-        let dir = TempDir::new("cut");
+        let dir = TempDir::fast("cut");
         let (finished, live) = small(dir.path(), compression);
         for file in [&finished, &live] {
             let bytes = std::fs::read(file).unwrap();
@@ -62,7 +62,8 @@ fn a_file_cut_off_at_any_byte_gives_what_stands_before_the_cut() {
                     assert!(recover(&cut).unwrap().already_sealed);
                 }
             }
-            assert_eq!(before, all.len());
+            // The live file's last byte is its last message's.
+            assert_eq!(before, all.len() - usize::from(!whole));
         }
     }
 }
@@ -91,10 +92,10 @@ proptest! {
     ) {
         thread_local! {
             static FILES: (TempDir, Vec<Vec<u8>>) = {
-                let dir = TempDir::new("flip");
+                let dir = TempDir::fast("flip");
                 let mut files = Vec::new();
                 for compression in [Compression::Zstd, Compression::None] {
-                    let of = TempDir::new("flip-of");
+                    let of = TempDir::fast("flip-of");
                     let (finished, live) = small(of.path(), compression);
                     files.push(std::fs::read(finished).unwrap());
                     files.push(std::fs::read(live).unwrap());
@@ -109,6 +110,9 @@ proptest! {
                 bytes[at] ^= with;
             }
             let path = dir.path().join("flipped.mcap");
+            if let Ok(recording) = Recording::from_bytes(Path::new("flipped"), bytes.clone()) {
+                recording.messages().for_each(|m| drop(m.unwrap()));
+            }
             std::fs::write(&path, bytes).unwrap();
             survive(&path);
         });
@@ -119,7 +123,7 @@ proptest! {
         records in proptest::collection::vec((0u8..=0x10, any::<Option<u64>>(), proptest::collection::vec(any::<u8>(), 0..80)), 0..8),
         zstd: bool,
     ) {
-        let dir = TempDir::new("records");
+        let dir = TempDir::fast("records");
         let mut bytes = mcap::MAGIC.to_vec();
         for (opcode, len, mut body) in records {
             if opcode == 6 {

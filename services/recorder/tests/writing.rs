@@ -19,13 +19,22 @@ fn sequences(path: &Path, topic: &str) -> Vec<u64> {
 #[test]
 fn files_rotate_at_a_keyframe_and_each_stands_alone() {
     let dir = TempDir::new("rotate");
-    let config = Config { max_size: Size(1 << 20), compression: dinrail_recorder::Compression::None, ..Config::default() };
+    let config = Config {
+        max_size: Size(1 << 20),
+        compression: dinrail_recorder::Compression::None,
+        ..Config::default()
+    };
     let mut rig = Rig::start(stack(dir.path()), config);
     let (mut seq, mut key) = (0, 0);
     let mut asked = 0;
     while rig.progress().files < 4 {
         let t = clock::mono_ns();
-        let mut messages: Vec<_> = (0..500).map(|i| { seq += 1; frame(seq, t + i) }).collect();
+        let mut messages: Vec<_> = (0..500)
+            .map(|i| {
+                seq += 1;
+                frame(seq, t + i)
+            })
+            .collect();
         // The plc answers with a keyframe in the middle of the traffic.
         if rig.shared.keyframe_wanted.load(Ordering::Relaxed) {
             key += 1;
@@ -66,12 +75,21 @@ fn files_rotate_at_a_keyframe_and_each_stands_alone() {
 #[test]
 fn without_a_keyframe_a_due_file_ends_all_the_same() {
     let dir = TempDir::new("no-key");
-    let config = Config { max_size: Size(1 << 20), compression: dinrail_recorder::Compression::None, ..Config::default() };
+    let config = Config {
+        max_size: Size(1 << 20),
+        compression: dinrail_recorder::Compression::None,
+        ..Config::default()
+    };
     let mut rig = Rig::start(stack(dir.path()), config);
     let mut seq = 0;
     wait_for("the second file", || {
         let t = clock::mono_ns();
-        let messages: Vec<_> = (0..500).map(|i| { seq += 1; frame(seq, t + i) }).collect();
+        let messages: Vec<_> = (0..500)
+            .map(|i| {
+                seq += 1;
+                frame(seq, t + i)
+            })
+            .collect();
         rig.send(&messages);
         rig.settle();
         rig.progress().files >= 2
@@ -93,7 +111,12 @@ fn the_quota_deletes_the_oldest_files() {
     let mut seq = 0;
     while rig.progress().files < 8 {
         let t = clock::mono_ns();
-        let mut messages: Vec<_> = (0..2000).map(|i| { seq += 1; frame(seq, t + i) }).collect();
+        let mut messages: Vec<_> = (0..2000)
+            .map(|i| {
+                seq += 1;
+                frame(seq, t + i)
+            })
+            .collect();
         messages.push(keyframe(seq, t));
         rig.send(&messages);
         rig.settle();
@@ -109,7 +132,11 @@ fn the_quota_deletes_the_oldest_files() {
 #[test]
 fn a_folder_that_goes_away_stops_the_recording_and_coming_back_resumes_it() {
     let dir = TempDir::new("gone");
-    let config = Config { max_size: Size(1 << 20), compression: dinrail_recorder::Compression::None, ..Config::default() };
+    let config = Config {
+        max_size: Size(1 << 20),
+        compression: dinrail_recorder::Compression::None,
+        ..Config::default()
+    };
     let mut rig = Rig::start(stack(dir.path()), config);
     rig.send(&[frame(1, clock::mono_ns())]);
     rig.settle();
@@ -120,7 +147,12 @@ fn a_folder_that_goes_away_stops_the_recording_and_coming_back_resumes_it() {
     let mut seq = 1;
     wait_for("the pause", || {
         let t = clock::mono_ns();
-        let messages: Vec<_> = (0..1000).map(|i| { seq += 1; frame(seq, t + i) }).collect();
+        let messages: Vec<_> = (0..1000)
+            .map(|i| {
+                seq += 1;
+                frame(seq, t + i)
+            })
+            .collect();
         rig.send(&messages);
         rig.settle();
         rig.progress().paused.is_some()
@@ -194,7 +226,8 @@ fn a_changed_program_is_attached_again() {
         scan::attachments(&file).unwrap().iter().filter(|a| a.name == "main.st").count() == 2
     });
     rig.stop();
-    let programs: Vec<_> = scan::attachments(&file).unwrap().into_iter().filter(|a| a.name == "main.st").collect();
+    let programs: Vec<_> =
+        scan::attachments(&file).unwrap().into_iter().filter(|a| a.name == "main.st").collect();
     assert_eq!(programs[0].data, b"PROGRAM main END_PROGRAM");
     assert_eq!(programs[1].data, b"PROGRAM other END_PROGRAM");
 }
@@ -229,8 +262,10 @@ fn what_tools_show() {
     let late = Filter { from_ns: Some(from + 2), to_ns: Some(from + 4), ..Filter::default() };
     assert_eq!(print(&late, Format::Json).1.messages, 2);
     let parts: Vec<_> = scan_contents(&file, "plc").unwrap().map(Result::unwrap).collect();
-    assert_eq!(parts.iter().map(|p| (p.keyframe, p.header.scan, p.tail.len())).collect::<Vec<_>>(),
-        [(false, 77, 3), (true, 1, 3)]);
+    assert_eq!(
+        parts.iter().map(|p| (p.keyframe, p.header.scan, p.tail.len())).collect::<Vec<_>>(),
+        [(false, 77, 3), (true, 1, 3)]
+    );
     assert_eq!(scan::scanned_services(&file).unwrap(), ["plc"]);
     let found = info(&file).unwrap();
     let text = found.to_string();

@@ -153,6 +153,12 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
+    #[allow(clippy::unreadable_literal, reason = "written by a tool")]
+    mod table {
+        include!("signal_table.rs");
+    }
+    use table::CANTOOLS;
+
     /// Bit by bit as the DBC rule reads: the oracle of the property test.
     fn bit_by_bit(frame: &[u8], start: u32, len: u32, order: ByteOrder) -> u64 {
         let mut raw = 0u64;
@@ -238,8 +244,6 @@ mod tests {
         assert_eq!(Signal::new(7, 16, ByteOrder::Motorola).unwrap().label(), "16 bits from 7 motorola");
         assert_eq!(Signal::new(4, 1, ByteOrder::Motorola).unwrap().label(), "1 bit from 4 motorola");
     }
-
-    include!("signal_table.rs");
 
     #[test]
     fn as_cantools_packs() {

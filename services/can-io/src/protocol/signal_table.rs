@@ -1,5 +1,5 @@
 // (start, length, motorola, signed, value, frame): made with cantools 45.1.0, `Message.encode`.
-const CANTOOLS: &[(u32, u32, bool, bool, i128, &str)] = &[
+pub(super) const CANTOOLS: &[(u32, u32, bool, bool, i128, &str)] = &[
     (0, 8, false, false, 82, "5200000000000000"),
     (0, 8, false, true, -128, "8000000000000000"),
     (0, 1, false, false, 1, "0100000000000000"),

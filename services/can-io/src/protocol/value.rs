@@ -150,7 +150,7 @@ impl Codec {
             Raw::Float if self.signal.len() == 32 => Number::Real(f64::from(f32::from_bits(raw as u32))),
             Raw::Float => Number::Real(f64::from_bits(raw)),
         };
-        Some(self.to_image(self.physical(number)))
+        Some(self.image_bytes(self.physical(number)))
     }
 
     fn physical(&self, number: Number) -> Number {
@@ -162,10 +162,10 @@ impl Codec {
 
     /// A physical value as bytes of the image, for substitutes.
     pub fn substitute(&self, value: f64) -> [u8; 8] {
-        self.to_image(Number::Real(value))
+        self.image_bytes(Number::Real(value))
     }
 
-    fn to_image(&self, number: Number) -> [u8; 8] {
+    fn image_bytes(&self, number: Number) -> [u8; 8] {
         let bits = self.iec.bits();
         let raw = match (self.iec.kind(), number) {
             (Kind::Bool, number) => u64::from(match number {

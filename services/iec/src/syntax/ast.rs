@@ -50,6 +50,8 @@ pub struct Pou {
     pub returns: Option<TypeSpec>,
     pub blocks: Vec<VarBlock>,
     pub body: Vec<Stmt>,
+    /// Ids of its statements: from, to (exclusive).
+    pub stmts: (u32, u32),
     /// The `END_...` word.
     pub end: Span,
 }

@@ -5,6 +5,7 @@ use dinrail_recorder::batch::{Batch, Pool, QUEUE};
 use dinrail_recorder::format::recorded_topics;
 use dinrail_recorder::writer::{Notice, Progress, Shared, ToWriter, Writer};
 use dinrail_recorder::{Config, disk};
+use ipc_types::clock;
 use ipc_types::payload::{
     CanFrame, Event, Inputs, JobResult, Payload, ScanPart, Stamp, Status, as_bytes, fd_flag,
 };
@@ -12,7 +13,6 @@ use ipc_types::port::ReadCounters;
 use ipc_types::stack::{ServiceEntry, Stack, TopicEntry};
 use ipc_types::topic::{EVENTS, TopicKind};
 use ipc_types::wiring::Wiring;
-use ipc_types::clock;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
@@ -24,9 +24,17 @@ pub struct TempDir(PathBuf);
 
 impl TempDir {
     pub fn new(name: &str) -> Self {
+        Self::below(&std::env::temp_dir(), name)
+    }
+    /// In memory: for tests that sync many small files.
+    pub fn fast(name: &str) -> Self {
+        let shm = Path::new("/dev/shm");
+        if shm.is_dir() { Self::below(shm, name) } else { Self::new(name) }
+    }
+    fn below(parent: &Path, name: &str) -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let n = COUNT.fetch_add(1, Ordering::Relaxed);
-        let path = std::env::temp_dir().join(format!("dinrail-rec-it-{}-{name}-{n}", std::process::id()));
+        let path = parent.join(format!("dinrail-rec-it-{}-{name}-{n}", std::process::id()));
         std::fs::create_dir_all(&path).unwrap();
         Self(path)
     }
@@ -127,7 +135,12 @@ pub fn keyframe(seq: u64, t_ns: u64) -> Message {
 
 /// One of every recorded kind, with values that a decoder can be asked for.
 pub fn one_of_each(t: u64) -> Vec<Message> {
-    let mut fd = CanFrame { can_id: 0x9ABC_DEF0, len: 12, fd_flags: fd_flag::FDF | fd_flag::BRS, ..CanFrame::default() };
+    let mut fd = CanFrame {
+        can_id: 0x9ABC_DEF0,
+        len: 12,
+        fd_flags: fd_flag::FDF | fd_flag::BRS,
+        ..CanFrame::default()
+    };
     fd.data[..12].copy_from_slice(b"hello, CAN!!");
     let inputs = Inputs { data_t_ns: t - 5, ranges: 2, ..Inputs::default() };
     let scan = ScanPart { scan: 77, part: 1, parts: 2, total: 5, ..ScanPart::default() };

@@ -1,0 +1,254 @@
+//! The command line: `dinrail NOUN VERB`, or a plain verb for what is used daily.
+
+use crate::supervise::service_main::ServiceArgs;
+use clap::{Args, Parser, Subcommand};
+use ipc_types::units::Span;
+use std::path::PathBuf;
+
+/// Programmable bus gateway and soft PLC.
+#[derive(Debug, Parser)]
+#[command(name = "dinrail", version, propagate_version = true, disable_help_subcommand = true)]
+pub struct Cli {
+    /// Results as JSON
+    #[arg(long, global = true)]
+    pub json: bool,
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// Which running stack is meant.
+#[derive(Debug, Clone, Args)]
+pub struct Which {
+    /// Name of the running stack; not needed when only one runs
+    #[arg(long, value_name = "NAME")]
+    pub stack: Option<String>,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Start a stack and keep it running in the foreground
+    Up {
+        /// Stack file, or a folder with a stack.toml
+        stack: PathBuf,
+        /// Stop after so long, e.g. 10s
+        #[arg(long = "for", value_name = "DURATION")]
+        duration: Option<Span>,
+    },
+    /// Start the built-in demo stack in ./dinrail-demo
+    Demo {
+        /// Stop after so long, e.g. 10s
+        #[arg(long = "for", value_name = "DURATION")]
+        duration: Option<Span>,
+        /// Folder for the stack's files and recordings
+        #[arg(long, default_value = "dinrail-demo", value_name = "FOLDER")]
+        dir: PathBuf,
+    },
+    /// Stop a running stack
+    Down(Which),
+    /// List the services of a running stack
+    Ps(Which),
+    /// How a running stack is
+    Status(Which),
+    /// What services printed
+    Logs {
+        /// Service; all of them when left out
+        service: Option<String>,
+        /// Go on with what comes
+        #[arg(short, long)]
+        follow: bool,
+        /// Lines from the past
+        #[arg(short = 'n', long, default_value_t = 100, value_name = "COUNT")]
+        lines: u32,
+        #[command(flatten)]
+        which: Which,
+    },
+    /// End one service and start it again
+    Restart {
+        service: String,
+        #[command(flatten)]
+        which: Which,
+    },
+    /// See and send CAN frames
+    #[command(subcommand)]
+    Can(CanCommand),
+    /// Control a PLC, read and change its variables
+    Plc {
+        /// The plc service; not needed when the stack has only one
+        #[arg(long, global = true, value_name = "NAME")]
+        service: Option<String>,
+        #[arg(long, global = true, value_name = "NAME")]
+        stack: Option<String>,
+        #[command(subcommand)]
+        command: PlcCommand,
+    },
+    /// Run a program in virtual time and print or compare its variables
+    Trace {
+        /// Source files
+        #[arg(required = true)]
+        files: Vec<PathBuf>,
+        /// Inputs and expected values; exit 1 at the first difference
+        #[arg(long, conflicts_with_all = ["cycle", "scans", "set"])]
+        case: Option<PathBuf>,
+        /// Time between scans
+        #[arg(long, value_name = "DURATION", required_unless_present = "case")]
+        cycle: Option<Span>,
+        /// Number of scans
+        #[arg(long, required_unless_present = "case")]
+        scans: Option<u64>,
+        /// Set a variable before a scan (the first is 0)
+        #[arg(long, value_name = "SCAN:VAR=VALUE")]
+        set: Vec<String>,
+    },
+    /// Compile a program to WebAssembly
+    Build {
+        #[arg(required = true)]
+        files: Vec<PathBuf>,
+        /// Where to write it
+        #[arg(short, long, value_name = "FILE")]
+        output: PathBuf,
+    },
+    /// Look into recordings
+    #[command(subcommand)]
+    Recordings(RecordingsCommand),
+    /// Run a recording again
+    Replay {
+        /// Recording (MCAP)
+        file: PathBuf,
+        /// Execute the program again scan by scan and compare
+        #[arg(long, required = true)]
+        verify: bool,
+        /// Compare this program, instead of the recorded one, against the recorded data
+        #[arg(long, value_name = "FILE")]
+        program: Vec<PathBuf>,
+        /// The plc service; not needed when the recording has only one
+        #[arg(long, value_name = "NAME")]
+        service: Option<String>,
+    },
+    /// Find what is wrong with a stack file without starting it
+    Check {
+        /// Stack file, or a folder with a stack.toml
+        stack: PathBuf,
+    },
+    /// List every point of the process image in all its notations
+    Map {
+        /// Stack file, or a folder with a stack.toml
+        stack: PathBuf,
+        /// Only what contains this text
+        filter: Option<String>,
+    },
+    /// Make a stack of your own from a built-in one
+    New {
+        /// Built-in stack; without it they are listed
+        #[arg(long, value_name = "STACK")]
+        from: Option<String>,
+        /// Folder; default is the stack's name
+        dir: Option<PathBuf>,
+    },
+    /// What a key of the stack file means
+    Explain {
+        /// `cycle`, `modbus-server.tcp.port`, `plc`; without it the kinds are listed
+        key: Option<String>,
+    },
+    /// JSON schema of stack files, for editors
+    Schema,
+    #[command(name = "__service", hide = true)]
+    Service(ServiceArgs),
+    #[command(name = "__clean", hide = true)]
+    Clean {
+        #[arg(long)]
+        root: PathBuf,
+        #[arg(long)]
+        parent: u32,
+    },
+}
+
+#[derive(Debug, Subcommand)]
+pub enum CanCommand {
+    /// Print frames as they are on the bus, one `candump -L` line each
+    Dump {
+        /// CAN service of the stack
+        bus: String,
+        /// Stop after so many frames
+        #[arg(long)]
+        count: Option<u64>,
+        /// Stop after so long
+        #[arg(long = "for", value_name = "DURATION")]
+        duration: Option<Span>,
+        #[command(flatten)]
+        which: Which,
+    },
+    /// Send frames and wait until they were on the bus
+    Send {
+        /// CAN service of the stack
+        bus: String,
+        /// 123#DEADBEEF, 12345678#00, 123#R4, 123##1AABB
+        #[arg(required = true)]
+        frames: Vec<String>,
+        #[command(flatten)]
+        which: Which,
+    },
+}
+
+#[derive(Debug, Subcommand)]
+pub enum PlcCommand {
+    /// State, scans, cycle times, forces
+    Status,
+    /// Stop scanning; outputs go to their safe state
+    Stop,
+    /// Go on from where it stopped
+    Run,
+    /// Start with all variables initial, RETAIN too
+    Cold,
+    /// Start with RETAIN kept
+    Warm,
+    /// Hold a variable or %-address at a value, whatever the program writes
+    Force {
+        #[arg(required = true, value_name = "VAR=VALUE")]
+        assignments: Vec<String>,
+    },
+    /// Let go of forced variables
+    Unforce {
+        #[arg(required_unless_present = "all", value_name = "VAR")]
+        variables: Vec<String>,
+        /// All of them
+        #[arg(long)]
+        all: bool,
+    },
+    /// Values of variables or %-addresses
+    Read {
+        #[arg(required = true, value_name = "VAR")]
+        variables: Vec<String>,
+    },
+    /// Set variables or %-addresses once
+    Write {
+        #[arg(required = true, value_name = "VAR=VALUE")]
+        assignments: Vec<String>,
+    },
+}
+
+#[derive(Debug, Subcommand)]
+pub enum RecordingsCommand {
+    /// Channels, counts, times, gaps
+    Info {
+        #[arg(required = true)]
+        files: Vec<PathBuf>,
+    },
+    /// Messages, one a line
+    Cat {
+        file: PathBuf,
+        /// Only this topic; a trailing * stands for any ending
+        #[arg(long)]
+        topic: Vec<String>,
+        /// At most so many messages
+        #[arg(long)]
+        count: Option<u64>,
+        /// CAN frames only, as `candump -L` lines, instead of JSON
+        #[arg(long)]
+        candump: bool,
+    },
+    /// Make files whole that were cut off, in their place
+    Recover {
+        #[arg(required = true)]
+        files: Vec<PathBuf>,
+    },
+}

@@ -1,0 +1,111 @@
+//! What is measured on, and what processes cost: `/proc`.
+
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::fs::read_to_string;
+use std::time::Instant;
+
+/// The machine of a report.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Machine {
+    pub cpu: String,
+    pub cores: usize,
+    pub kernel: String,
+    /// Runnable processes over the last minute, before the bench: figures of a busy machine mean little.
+    pub load: f64,
+}
+
+impl Machine {
+    pub fn read() -> Self {
+        let info = read_to_string("/proc/cpuinfo").unwrap_or_default();
+        let model = |key: &str| {
+            let line = info.lines().find(|l| l.starts_with(key))?;
+            Some(line.split_once(':')?.1.trim().to_owned())
+        };
+        // Arm has no model name.
+        let cpu = model("model name").or_else(|| model("Model")).or_else(|| model("CPU part"));
+        let kernel = read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
+        let load = read_to_string("/proc/loadavg").unwrap_or_default();
+        Self {
+            cpu: cpu.unwrap_or_else(|| std::env::consts::ARCH.to_owned()),
+            cores: std::thread::available_parallelism().map_or(0, Into::into),
+            kernel: kernel.trim().to_owned(),
+            load: load.split(' ').next().and_then(|n| n.parse().ok()).unwrap_or(f64::NAN),
+        }
+    }
+}
+
+impl fmt::Display for Machine {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { cpu, cores, kernel, load } = self;
+        write!(f, "{cpu}, {cores} cores, Linux {kernel}, load {load:.2} before")
+    }
+}
+
+/// CPU time of a process so far, in seconds; `None` when it is gone.
+pub fn cpu_seconds(pid: u32) -> Option<f64> {
+    let text = read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    // Behind the name, which may hold anything: state is field 3, utime 14, stime 15.
+    let fields: Vec<&str> = text.rsplit_once(')')?.1.split_whitespace().collect();
+    let ticks = fields.get(11)?.parse::<f64>().ok()? + fields.get(12)?.parse::<f64>().ok()?;
+    Some(ticks / rustix::param::clock_ticks_per_second() as f64)
+}
+
+/// CPU of processes over a span of time.
+pub struct CpuMeter {
+    began: Instant,
+    /// Name, pid, CPU seconds at the beginning.
+    processes: Vec<(String, u32, f64)>,
+}
+
+impl CpuMeter {
+    pub fn start(processes: Vec<(String, u32)>) -> Self {
+        let processes =
+            processes.into_iter().filter_map(|(name, pid)| Some((name, pid, cpu_seconds(pid)?))).collect();
+        Self { began: Instant::now(), processes }
+    }
+
+    /// Per cent of one CPU, each process.
+    pub fn stop(self) -> Vec<(String, f64)> {
+        let seconds = self.began.elapsed().as_secs_f64();
+        let percent = |(name, pid, before): (String, u32, f64)| {
+            Some((name, (cpu_seconds(pid)? - before) / seconds * 100.0))
+        };
+        self.processes.into_iter().filter_map(percent).collect()
+    }
+}
+
+/// Resident memory of a process.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Memory {
+    /// Shared pages counted by their share: sums of processes count each page once.
+    pub pss_bytes: u64,
+    /// Shared pages counted whole.
+    pub rss_bytes: u64,
+}
+
+/// Resident memory; `None` when the process is gone.
+pub fn memory(pid: u32) -> Option<Memory> {
+    let text = read_to_string(format!("/proc/{pid}/smaps_rollup")).ok()?;
+    let bytes = |key: &str| {
+        let line = text.lines().find(|l| l.starts_with(key))?;
+        Some(line.split_whitespace().nth(1)?.parse::<u64>().ok()? * 1024)
+    };
+    Some(Memory { pss_bytes: bytes("Pss:")?, rss_bytes: bytes("Rss:")? })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn this_process_has_memory_and_time() {
+        let own = std::process::id();
+        let memory = memory(own).unwrap();
+        assert!(memory.pss_bytes > 100_000 && memory.rss_bytes >= memory.pss_bytes, "{memory:?}");
+        assert!(cpu_seconds(own).unwrap() >= 0.0);
+        assert_eq!(cpu_seconds(u32::MAX), None);
+        let machine = Machine::read();
+        assert!(machine.cores > 0 && !machine.kernel.is_empty() && !machine.cpu.is_empty());
+    }
+}

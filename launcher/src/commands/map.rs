@@ -1,0 +1,339 @@
+//! `dinrail map STACK`: every point of the process image in all its notations, so that nobody counts bytes.
+
+use crate::commands::{print, table};
+use crate::stackfile::{LoadError, area_bytes, exchangers, load, percent};
+use anyhow::Context as _;
+use dinrail_iec::artifact::{AreaKind, Storage, VarKind};
+use dinrail_modbus::address::{Address, Addressing, AreaSizes, Width};
+use dinrail_modbus::map::RegisterMap;
+use dinrail_modbus::map_config::{MapConfig, MapRow, traditional_number};
+use dinrail_plc::program;
+use ipc_types::Stack;
+use ipc_types::stack::ServiceEntry;
+use ipc_types::wiring::{Area, ImageRange, OnBad};
+use serde::Serialize;
+use std::path::Path;
+
+/// One point of an image.
+#[derive(Debug, Serialize)]
+struct Point {
+    plc: String,
+    /// `%IW0` counted in elements (CODESYS), absent when the bytes are no whole element.
+    element: Option<String>,
+    /// `%IW0` counted in bytes (OpenPCS, Siemens).
+    byte: Option<String>,
+    /// Always: `%IB0 to %IB1`.
+    bytes: String,
+    #[serde(rename = "type")]
+    type_name: Option<String>,
+    symbol: Option<String>,
+    modbus: Vec<Register>,
+    /// What it is on the field side.
+    field: String,
+    service: String,
+    role: Role,
+    /// %IB that shows its quality.
+    status: Option<String>,
+}
+
+/// What the service does with a point.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+enum Role {
+    /// Delivers it into %I.
+    Owns,
+    /// Sends it to the field.
+    Reads,
+    /// Has a program variable there.
+    Declares,
+}
+
+/// Where a Modbus client finds a point.
+#[derive(Debug, Serialize)]
+struct Register {
+    /// The modbus-server; absent = the stack has none and this is where the default map would show it.
+    server: Option<String>,
+    table: &'static str,
+    /// From 0, as on the wire.
+    address: u16,
+    /// From 1, with the digit of the table: 40001.
+    number: String,
+}
+
+/// Registers of one server, for what no field service exchanges.
+#[derive(Debug, Serialize)]
+struct ServerMap {
+    server: String,
+    plc: String,
+    ranges: Vec<MapRow>,
+}
+
+/// Prints the points of a stack, all or those with `filter` in one of their columns.
+pub fn run(path: &Path, filter: Option<&str>, as_json: bool) -> anyhow::Result<()> {
+    let loaded = match load(path) {
+        Ok(loaded) => loaded,
+        Err(LoadError { findings }) => {
+            super::check::report(&findings);
+            anyhow::bail!("{}: only a stack without errors has a map", path.display());
+        }
+    };
+    let (points, servers) = collect(&loaded.stack)?;
+    let needle = filter.map(str::to_lowercase);
+    let points: Vec<Point> = points
+        .into_iter()
+        .filter(|p| needle.as_ref().is_none_or(|n| row(p).join("\t").to_lowercase().contains(n)))
+        .collect();
+    if as_json {
+        print(&format!("{:#}\n", serde_json::json!({ "points": points, "registers": servers })));
+        return Ok(());
+    }
+    print(&text(&points, if filter.is_some() { &[] } else { &servers }));
+    Ok(())
+}
+
+fn collect(stack: &Stack) -> anyhow::Result<(Vec<Point>, Vec<ServerMap>)> {
+    let mut points = Vec::new();
+    let mut servers = Vec::new();
+    for plc in stack.services.iter().filter(|s| s.kind == "plc") {
+        let sizes = AreaSizes {
+            input: area_bytes(&plc.config, "input_bytes") as u32,
+            output: area_bytes(&plc.config, "output_bytes") as u32,
+            marker: area_bytes(&plc.config, "marker_bytes") as u32,
+        };
+        let maps = maps_of(stack, plc, sizes)?;
+        for (server, map) in &maps {
+            if let Some(server) = server {
+                let ranges = map.rows(Addressing::Element);
+                servers.push(ServerMap { server: server.clone(), plc: plc.name.clone(), ranges });
+            }
+        }
+        let mut ranges: Vec<(&ServiceEntry, ImageRange, Role)> = Vec::new();
+        for (entry, wiring) in exchangers(stack, &plc.name) {
+            ranges.extend(wiring.inputs.iter().map(|r| (entry, r.clone(), Role::Owns)));
+            ranges.extend(wiring.outputs.iter().map(|r| (entry, r.clone(), Role::Reads)));
+        }
+        ranges.extend(variables(stack, plc)?.into_iter().map(|r| (plc, r, Role::Declares)));
+        ranges.sort_by_key(|(entry, r, role)| (r.area, r.byte, r.bit, *role, entry.index));
+        points.extend(ranges.iter().map(|(entry, range, role)| point(plc, entry, range, *role, &maps)));
+    }
+    Ok((points, servers))
+}
+
+/// The variables of the program that have a %-address, but for those that the stack file's symbols made.
+fn variables(stack: &Stack, plc: &ServiceEntry) -> anyhow::Result<Vec<ImageRange>> {
+    let config: dinrail_plc::Config = serde_json::from_value(plc.config.clone())
+        .with_context(|| format!("configuration of service '{}'", plc.name))?;
+    if config.program.is_empty() {
+        return Ok(Vec::new());
+    }
+    let setup = program::setup(&config, stack, &plc.name);
+    let compiled = program::load(&stack.dir, &config.program, &setup)
+        .with_context(|| format!("program of service '{}'", plc.name))?;
+    let map = &compiled.program.artifact.map;
+    let mut found = Vec::new();
+    for symbol in map.symbols.iter().filter(|s| s.address.is_some() && s.kind != VarKind::Mapped) {
+        let (area, memory) = match symbol.area {
+            AreaKind::Input => (Area::Input, map.layout.input),
+            AreaKind::Output => (Area::Output, map.layout.output),
+            AreaKind::Marker => (Area::Marker, map.layout.marker),
+            AreaKind::Retain | AreaKind::Data => continue,
+        };
+        let Some(byte) = symbol.offset.checked_sub(memory.offset) else { continue };
+        let (bit, bytes) = match symbol.storage {
+            Storage::Bit(bit) => (Some(bit), 1),
+            Storage::Millis32 => (None, 4),
+            Storage::Plain => (None, symbol.elem.bytes().saturating_mul(symbol.elements() as u32)),
+        };
+        let file = map.files.get(symbol.file as usize).map_or("program", String::as_str);
+        found.push(ImageRange {
+            area,
+            byte,
+            bit,
+            bytes,
+            type_name: Some(match symbol.dims.len() {
+                0 => symbol.elem.name().to_owned(),
+                _ => format!("{} x {}", symbol.elements(), symbol.elem.name()),
+            }),
+            symbol: Some(symbol.path.clone()),
+            label: format!("{file}:{}", symbol.line),
+            key: String::new(),
+            on_bad: OnBad::Hold,
+            status_byte: None,
+        });
+    }
+    Ok(found)
+}
+
+/// The register maps over the image of a plc; the default map when there is no server.
+fn maps_of(
+    stack: &Stack,
+    plc: &ServiceEntry,
+    sizes: AreaSizes,
+) -> anyhow::Result<Vec<(Option<String>, RegisterMap)>> {
+    let mut maps = Vec::new();
+    let servers = stack.services.iter().filter(|s| s.kind == "modbus-server");
+    for server in servers.filter(|s| s.wiring.plc.as_deref() == Some(&plc.name)) {
+        let config: dinrail_modbus::Config = serde_json::from_value(server.config.clone())
+            .with_context(|| format!("configuration of service '{}'", server.name))?;
+        let mut map = config
+            .map
+            .build(AreaSizes::MAX, config.addressing)
+            .with_context(|| format!("map of service '{}'", server.name))?;
+        map.set_sizes(sizes);
+        maps.push((Some(server.name.clone()), map));
+    }
+    if maps.is_empty() {
+        let map = MapConfig::default().build(sizes, Addressing::Element).context("default map")?;
+        maps.push((None, map));
+    }
+    Ok(maps)
+}
+
+fn point(
+    plc: &ServiceEntry,
+    entry: &ServiceEntry,
+    range: &ImageRange,
+    role: Role,
+    maps: &[(Option<String>, RegisterMap)],
+) -> Point {
+    let width = match (range.bit, range.bytes) {
+        (Some(_), _) => Some(Width::Bit),
+        (None, 1) => Some(Width::Byte),
+        (None, 2) => Some(Width::Word),
+        (None, 4) => Some(Width::Double),
+        (None, 8) => Some(Width::Long),
+        _ => None,
+    };
+    let address = |width| Address { area: range.area, width, byte: range.byte, bit: range.bit.unwrap_or(0) };
+    let mut modbus = Vec::new();
+    for (server, map) in maps {
+        for (table, at) in map.entries_at(address(width.unwrap_or(Width::Byte))) {
+            modbus.push(Register {
+                server: server.clone(),
+                table: table.name(),
+                address: at,
+                number: traditional_number(table, at),
+            });
+        }
+    }
+    let whole = |w: &Width| range.byte % w.bytes() == 0;
+    Point {
+        plc: plc.name.clone(),
+        element: width.filter(whole).map(|w| address(w).text(Addressing::Element)),
+        byte: width.map(|w| address(w).text(Addressing::Byte)),
+        bytes: percent(range.area, range.byte, range.bit, range.bytes),
+        type_name: range.type_name.clone(),
+        symbol: range.symbol.clone(),
+        modbus,
+        field: range.label.clone(),
+        service: entry.name.clone(),
+        role,
+        status: range.status_byte.map(|b| percent(Area::Input, b, None, 1)),
+    }
+}
+
+const HEAD: [&str; 8] = ["ELEMENT", "BYTE", "BYTES", "TYPE", "SYMBOL", "MODBUS", "FIELD", "SERVICE"];
+
+fn row(point: &Point) -> Vec<String> {
+    let several = point.modbus.iter().any(|r| r.server != point.modbus[0].server);
+    let registers: Vec<String> = point
+        .modbus
+        .iter()
+        .map(|r| {
+            let server = r.server.as_ref().filter(|_| several).map(|s| format!("{s}: ")).unwrap_or_default();
+            format!("{server}{} {} ({})", r.table, r.address, r.number)
+        })
+        .collect();
+    let or_dash = |text: &Option<String>| text.clone().unwrap_or_else(|| "-".to_owned());
+    let status = point.status.as_ref().map(|s| format!(", quality in {s}")).unwrap_or_default();
+    let arrow = match point.role {
+        Role::Owns => "from",
+        Role::Reads => "to",
+        Role::Declares => "in",
+    };
+    vec![
+        or_dash(&point.element),
+        or_dash(&point.byte),
+        point.bytes.clone(),
+        or_dash(&point.type_name),
+        or_dash(&point.symbol),
+        if registers.is_empty() { "-".to_owned() } else { registers.join(", ") },
+        format!("{}{status}", point.field),
+        format!("{arrow} {}", point.service),
+    ]
+}
+
+fn text(points: &[Point], servers: &[ServerMap]) -> String {
+    let mut plcs: Vec<&str> = points.iter().map(|p| p.plc.as_str()).collect();
+    plcs.dedup();
+    let mut out = String::new();
+    for plc in &plcs {
+        if plcs.len() > 1 {
+            out += &format!("image of '{plc}'\n");
+        }
+        let rows: Vec<Vec<String>> = points.iter().filter(|p| p.plc == *plc).map(row).collect();
+        out += &table(&HEAD, &rows);
+    }
+    if points.is_empty() {
+        out += "no point matches\n";
+    }
+    for server in servers {
+        out += &format!("\nregisters of '{}' over the image of '{}'\n", server.server, server.plc);
+        let rows: Vec<Vec<String>> = server
+            .ranges
+            .iter()
+            .map(|r| {
+                let notes = [
+                    r.word_order.map(|o| if o == dinrail_modbus::map_config::WordOrder::HighFirst { "high word first" } else { "low word first" }),
+                    r.swap_bytes.then_some("bytes swapped"),
+                    Some(if r.writable { "read, write" } else { "read" }),
+                ];
+                vec![
+                    r.table.name().to_owned(),
+                    format!("{} to {}", r.first, r.last),
+                    format!("{} to {}", r.first_number, r.last_number),
+                    format!("{} to {}", r.first_address, r.last_address),
+                    notes.into_iter().flatten().collect::<Vec<_>>().join(", "),
+                ]
+            })
+            .collect();
+        out += &table(&["TABLE", "ADDRESS", "NUMBER", "ELEMENTS", "ACCESS"], &rows);
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::stackfile::real_tests::{Folder, STACK};
+
+    #[test]
+    fn every_point_is_shown_in_all_notations() {
+        let folder = Folder::new("map");
+        let loaded = folder.load(STACK).unwrap();
+        let (points, servers) = collect(&loaded.stack).unwrap();
+        let lines: Vec<String> = points.iter().map(|p| row(p).join(" | ")).collect();
+        assert_eq!(
+            lines,
+            [
+                "%IW0 | %IW0 | %IB0 to %IB1 | UINT | Speed | input_registers 0 (30001) | from frame 123h, 16 bits from 0 intel | from io",
+                "%QW0 | %QW0 | %QB0 to %QB1 | UINT | Command | holding_registers 32768 (432769) | to frame 210h, 16 bits from 0 intel | to io",
+                "%MW0 | %MW0 | %MB0 to %MB1 | UINT | Main.Setpoint | holding_registers 0 (40001) | main.st:3 | in plc",
+                "%MW1 | %MW2 | %MB2 to %MB3 | UINT | Main.Shown | holding_registers 1 (40002) | main.st:4 | in plc",
+            ]
+        );
+        assert_eq!(servers.len(), 1);
+        assert!(text(&points, &servers).contains("registers of 'modbus' over the image of 'plc'"));
+        assert_eq!(text(&[], &[]), "no point matches\n");
+    }
+
+    #[test]
+    fn without_a_server_the_default_map_is_shown() {
+        let folder = Folder::new("map-default");
+        let at = STACK.find("[[service]]\nname = \"modbus\"").unwrap();
+        let loaded = folder.load(&STACK[..at]).unwrap();
+        let (points, servers) = collect(&loaded.stack).unwrap();
+        assert!(servers.is_empty());
+        assert_eq!((points[0].modbus[0].number.as_str(), points[0].modbus[0].server.as_deref()), ("30001", None));
+    }
+}

@@ -1,0 +1,302 @@
+//! The control socket of a running stack: `<root>/control.sock`, one JSON object a line in both directions.
+//!
+//! Never blocks and never grows without bound: a client that does not read is dropped.
+
+use super::logbook::Line;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::io::{self, Read, Write};
+use std::os::fd::{AsFd, BorrowedFd};
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::path::Path;
+
+/// Clients at once.
+pub const CLIENTS_MAX: usize = 16;
+/// Longest request line.
+pub const REQUEST_BYTES_MAX: usize = 64 * 1024;
+/// Answers that may wait for a client.
+pub const OUTPUT_BYTES_MAX: usize = 16 * 1024 * 1024;
+
+/// What a client asks.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "do", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Request {
+    /// One row a service.
+    Ps {},
+    /// The stack as a whole.
+    Status {},
+    /// The last lines of one service or of all, and with `follow` those that come.
+    Logs {
+        #[serde(default)]
+        service: Option<String>,
+        lines: u32,
+        #[serde(default)]
+        follow: bool,
+    },
+    /// Ends one process and starts it again; answered when the new one is ready.
+    Restart { service: String },
+    /// Stops the stack; the connection is closed when everything is gone.
+    Down {},
+}
+
+/// A service in `ps`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ServiceRow {
+    pub service: String,
+    pub kind: String,
+    /// `starting`, `running`, `hung`, `restarting`, `back-off`, `held`, `stopping`, `ended`.
+    pub state: String,
+    /// What the service says of itself: `starting`, `ready`, `degraded`, `stopping`.
+    pub health: String,
+    /// 0 while there is no process.
+    pub pid: u32,
+    pub generation: u32,
+    pub restarts: u32,
+    pub uptime_ms: u64,
+    /// Of one CPU, over the last second.
+    pub cpu_percent: f64,
+    pub rss_bytes: u64,
+}
+
+/// The stack as a whole.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct StackStatus {
+    pub stack: String,
+    pub pid: u32,
+    pub build_id: String,
+    /// `starting`, `running`, `degraded`, `stopping`, `failed`.
+    pub state: String,
+    pub uptime_ms: u64,
+    pub services: u32,
+    pub ready: u32,
+    pub held: Vec<String>,
+    pub failed: Option<String>,
+}
+
+/// A line of a service's log.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LogLine {
+    pub utc_ns: i64,
+    pub service: String,
+    pub line: String,
+}
+
+/// An answer.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Reply {
+    Ps(Vec<ServiceRow>),
+    Status(StackStatus),
+    Log(LogLine),
+    Restarted { service: String, generation: u32, after_ms: u64 },
+    Stopping { pid: u32 },
+    /// Nothing more comes.
+    End,
+    Error(String),
+}
+
+struct Client {
+    stream: UnixStream,
+    input: Vec<u8>,
+    output: Vec<u8>,
+    /// Wants new log lines of this service, `None` = of all.
+    follows: Option<Option<usize>>,
+}
+
+/// What came of reading a client.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Heard {
+    Requests(Vec<Result<Request, String>>),
+    Gone,
+}
+
+/// The listening end.
+pub struct ControlServer {
+    listener: UnixListener,
+    clients: BTreeMap<u64, Client>,
+    next: u64,
+}
+
+impl ControlServer {
+    pub fn open(path: &Path) -> io::Result<Self> {
+        let listener = UnixListener::bind(path)?;
+        listener.set_nonblocking(true)?;
+        Ok(Self { listener, clients: BTreeMap::new(), next: 0 })
+    }
+
+    pub fn fd(&self) -> BorrowedFd<'_> {
+        self.listener.as_fd()
+    }
+
+    pub fn client_fd(&self, id: u64) -> Option<BorrowedFd<'_>> {
+        self.clients.get(&id).map(|c| c.stream.as_fd())
+    }
+
+    /// Takes new clients; those above the limit are told and closed.
+    pub fn accept(&mut self) -> Vec<u64> {
+        let mut new = Vec::new();
+        while let Ok((mut stream, _)) = self.listener.accept() {
+            if stream.set_nonblocking(true).is_err() {
+                continue;
+            }
+            if self.clients.len() >= CLIENTS_MAX {
+                let _ = stream.write_all(b"{\"error\":\"16 clients are connected already\"}\n");
+                continue;
+            }
+            self.next += 1;
+            self.clients
+                .insert(self.next, Client { stream, input: Vec::new(), output: Vec::new(), follows: None });
+            new.push(self.next);
+        }
+        new
+    }
+
+    /// Reads what a client sent.
+    pub fn hear(&mut self, id: u64) -> Heard {
+        let Some(client) = self.clients.get_mut(&id) else { return Heard::Gone };
+        let mut chunk = [0u8; 4096];
+        // Bounded a turn, like everything in the launcher's loop.
+        for _ in 0..32 {
+            match client.stream.read(&mut chunk) {
+                Ok(0) => return Heard::Gone,
+                Ok(n) => client.input.extend_from_slice(&chunk[..n]),
+                Err(e) if e.kind() == io::ErrorKind::WouldBlock => break,
+                Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
+                Err(_) => return Heard::Gone,
+            }
+            if client.input.len() > REQUEST_BYTES_MAX {
+                break;
+            }
+        }
+        let mut requests = Vec::new();
+        while let Some(end) = client.input.iter().position(|b| *b == b'\n') {
+            let line: Vec<u8> = client.input.drain(..=end).collect();
+            requests.push(serde_json::from_slice(&line).map_err(|e| format!("request not understood: {e}")));
+        }
+        if client.input.len() > REQUEST_BYTES_MAX {
+            return Heard::Gone;
+        }
+        Heard::Requests(requests)
+    }
+
+    /// Answers; `false` when the client does not read and should be dropped.
+    pub fn answer(&mut self, id: u64, reply: &Reply) -> bool {
+        let Some(client) = self.clients.get_mut(&id) else { return false };
+        let Ok(text) = serde_json::to_vec(reply) else { return false };
+        client.output.extend_from_slice(&text);
+        client.output.push(b'\n');
+        client.output.len() <= OUTPUT_BYTES_MAX
+    }
+
+    pub fn follow(&mut self, id: u64, service: Option<usize>) {
+        if let Some(client) = self.clients.get_mut(&id) {
+            client.follows = Some(service);
+        }
+    }
+
+    /// Passes a new log line to those who follow; returns those to drop.
+    pub fn publish(&mut self, line: &Line, name: &str) -> Vec<u64> {
+        let ids: Vec<u64> = self
+            .clients
+            .iter()
+            .filter(|(_, c)| c.follows.is_some_and(|f| f.is_none_or(|s| s == line.service)))
+            .map(|(id, _)| *id)
+            .collect();
+        let reply = Reply::Log(LogLine {
+            utc_ns: line.utc_ns,
+            service: name.to_owned(),
+            line: line.text.clone(),
+        });
+        ids.into_iter().filter(|id| !self.answer(*id, &reply)).collect()
+    }
+
+    /// Writes what waits; returns whether something still waits, and whom to drop.
+    pub fn flush(&mut self) -> (bool, Vec<u64>) {
+        let (mut waits, mut broken) = (false, Vec::new());
+        for (id, client) in &mut self.clients {
+            while !client.output.is_empty() {
+                match client.stream.write(&client.output) {
+                    Ok(n) => drop(client.output.drain(..n)),
+                    Err(e) if e.kind() == io::ErrorKind::WouldBlock => {
+                        waits = true;
+                        break;
+                    }
+                    Err(_) => {
+                        broken.push(*id);
+                        break;
+                    }
+                }
+            }
+        }
+        (waits, broken)
+    }
+
+    pub fn drop_client(&mut self, id: u64) {
+        self.clients.remove(&id);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::{BufRead, BufReader};
+
+    fn pair(name: &str) -> (ControlServer, UnixStream, std::path::PathBuf) {
+        let path = std::env::temp_dir().join(format!("dinrail-control-{}-{name}", std::process::id()));
+        let _ = std::fs::remove_file(&path);
+        let server = ControlServer::open(&path).unwrap();
+        let client = UnixStream::connect(&path).unwrap();
+        (server, client, path)
+    }
+
+    #[test]
+    fn requests_come_in_pieces_and_answers_go_out() {
+        let (mut server, mut client, path) = pair("pieces");
+        let ids = server.accept();
+        client.write_all(b"{\"do\":\"ps\"}\n{\"do\":\"fly\"}\n{\"do\":\"rest").unwrap();
+        let Heard::Requests(heard) = server.hear(ids[0]) else { panic!("gone") };
+        assert_eq!(heard[0], Ok(Request::Ps {}));
+        assert!(heard[1].as_ref().unwrap_err().contains("unknown variant `fly`"));
+        client.write_all(b"art\",\"service\":\"plc\"}\n").unwrap();
+        assert_eq!(
+            server.hear(ids[0]),
+            Heard::Requests(vec![Ok(Request::Restart { service: "plc".into() })])
+        );
+        assert!(server.answer(ids[0], &Reply::End));
+        assert_eq!(server.flush(), (false, vec![]));
+        let mut line = String::new();
+        BufReader::new(&client).read_line(&mut line).unwrap();
+        assert_eq!(line, "\"end\"\n");
+        drop(client);
+        assert_eq!(server.hear(ids[0]), Heard::Gone);
+        std::fs::remove_file(path).unwrap();
+    }
+
+    #[test]
+    fn a_client_that_never_ends_its_line_or_never_reads_is_dropped() {
+        let (mut server, mut client, path) = pair("flood");
+        let id = server.accept()[0];
+        client.set_nonblocking(true).unwrap();
+        let mut gone = false;
+        for _ in 0..100 {
+            let _ = client.write(&[b'x'; 4096]);
+            gone |= server.hear(id) == Heard::Gone;
+        }
+        assert!(gone);
+        let reply = Reply::Error("x".repeat(1 << 20));
+        assert!((0..20).any(|_| !server.answer(id, &reply)));
+        std::fs::remove_file(path).unwrap();
+    }
+
+    #[test]
+    fn the_seventeenth_client_is_told() {
+        let (mut server, first, path) = pair("crowd");
+        let more: Vec<_> = (0..CLIENTS_MAX).map(|_| UnixStream::connect(&path).unwrap()).collect();
+        assert_eq!(server.accept().len(), CLIENTS_MAX);
+        let mut line = String::new();
+        BufReader::new(more.last().unwrap()).read_line(&mut line).unwrap();
+        assert!(line.contains("16 clients"));
+        drop(first);
+        std::fs::remove_file(path).unwrap();
+    }
+}

@@ -1,0 +1,632 @@
+//! When to start, signal, restart, hold and give up: decided here, done elsewhere.
+//!
+//! Sans-I/O: facts and the time (CLOCK_MONOTONIC in ns) go in, [`Action`]s come out. No clock, process, file or
+//! middleware may be touched in this module, so that every rule of supervision is tested in virtual time.
+//!
+//! The life of a service:
+//!
+//! ```text
+//! Idle -> Starting -> Running -> (death) -> Cleaning -> Starting        first restart at once
+//!                  \-> Aborting -> Killed /          \-> Waiting -> Starting   later ones after a back-off
+//!                                                     \-> Held          budget used up, or the stack fails
+//! Stopping -> Ended                                  in reverse order, recorders last
+//! ```
+
+use ipc_types::event::{EventKind, Level};
+use ipc_types::payload::HealthState;
+use serde_json::{Value, json};
+use std::collections::VecDeque;
+
+/// Between SIGABRT, which leaves a core and a backtrace, and SIGKILL.
+pub const ABORT_GRACE_NS: u64 = 500_000_000;
+/// Between SIGTERM and SIGKILL, unless the stack says otherwise.
+pub const TERM_GRACE_NS: u64 = 2_000_000_000;
+/// So many clean-ups of dead nodes may fail in a row before the stack fails.
+pub const CLEAN_ATTEMPTS: u32 = 3;
+
+/// What happens when the restart budget is used up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Exhausted {
+    /// The service stays down, its inherited listeners are closed; the others go on.
+    #[default]
+    Hold,
+    /// The whole stack stops with exit code 1.
+    FailStack,
+}
+
+/// How one service is supervised.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Rule {
+    /// So many restarts...
+    pub max: u32,
+    /// ... within this time; a run that was ready for so long counts as healthy and resets the budget.
+    pub within_ns: u64,
+    /// Delay of the second restart in a row; doubles up to `backoff_max_ns`. The first one has no delay.
+    pub backoff_first_ns: u64,
+    pub backoff_max_ns: u64,
+    pub on_exhausted: Exhausted,
+    /// Silence after which a service that was ready counts as hanging.
+    pub hang_timeout_ns: u64,
+    /// A service that has not reported ready so long after its start counts as hanging: longer, because
+    /// compiling a large program comes before.
+    pub start_timeout_ns: u64,
+    /// Started first and stopped last, so that a recording holds everything.
+    pub recorder: bool,
+}
+
+impl Default for Rule {
+    fn default() -> Self {
+        Self {
+            max: 5,
+            within_ns: 10_000_000_000,
+            backoff_first_ns: 50_000_000,
+            backoff_max_ns: 5_000_000_000,
+            on_exhausted: Exhausted::Hold,
+            hang_timeout_ns: 2_000_000_000,
+            start_timeout_ns: 10_000_000_000,
+            recorder: false,
+        }
+    }
+}
+
+/// Signals that supervision sends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kill {
+    Term,
+    Abort,
+    Kill,
+}
+
+/// Something that happened, for the rail, the recording and the log.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Notice {
+    /// Index of the service it is about; `None` = the stack.
+    pub service: Option<usize>,
+    pub kind: EventKind,
+    pub level: Level,
+    pub message: String,
+    pub detail: Value,
+}
+
+/// What the caller has to do, in order.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Action {
+    /// Start the process; report with [`Policy::started`] or [`Policy::died`].
+    Spawn { service: usize, generation: u32 },
+    Signal { service: usize, signal: Kill },
+    /// Run the helper that cleans dead nodes; report with [`Policy::clean_done`].
+    Clean,
+    /// Close the listeners that the service would inherit, so that clients are refused, not kept waiting.
+    CloseListeners { service: usize },
+    Tell(Notice),
+    /// Every process has ended.
+    Ended,
+}
+
+/// How a process ended.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Death {
+    /// `killed by SIGKILL`, `exit code 1`.
+    pub how: String,
+    /// Signal, exit code, last log lines.
+    pub detail: Value,
+}
+
+/// Where a service is in its life.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Phase {
+    Idle,
+    Starting,
+    Running,
+    /// SIGABRT was sent because it hangs.
+    Aborting {
+        kill_at: u64,
+    },
+    /// SIGKILL was sent because it hangs.
+    Killed,
+    /// SIGTERM was sent by `restart`.
+    Restarting {
+        kill_at: u64,
+    },
+    /// Dead; the clean-up number `round` comes before the restart.
+    Cleaning {
+        round: u64,
+        planned: bool,
+    },
+    /// Dead; started again at this time.
+    Waiting {
+        until: u64,
+    },
+    Held,
+    /// SIGTERM was sent by the end of the stack.
+    Stopping {
+        kill_at: u64,
+    },
+    Ended,
+}
+
+impl Phase {
+    /// A process exists.
+    pub fn alive(self) -> bool {
+        matches!(
+            self,
+            Self::Starting
+                | Self::Running
+                | Self::Aborting { .. }
+                | Self::Killed
+                | Self::Restarting { .. }
+                | Self::Stopping { .. }
+        )
+    }
+
+    /// Word in `ps`.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Idle => "idle",
+            Self::Starting => "starting",
+            Self::Running => "running",
+            Self::Aborting { .. } | Self::Killed => "hung",
+            Self::Restarting { .. } | Self::Cleaning { .. } => "restarting",
+            Self::Waiting { .. } => "back-off",
+            Self::Held => "held",
+            Self::Stopping { .. } => "stopping",
+            Self::Ended => "ended",
+        }
+    }
+}
+
+/// A supervised service.
+#[derive(Debug, Clone)]
+pub struct Slot {
+    pub name: String,
+    pub rule: Rule,
+    pub phase: Phase,
+    /// 1 at the first start.
+    pub generation: u32,
+    /// When the present process was started.
+    pub since: u64,
+    /// When the present process reported ready; 0 = not yet.
+    pub ready_at: u64,
+    last_sign: u64,
+    /// Times of unplanned restarts within the budget's window.
+    recent: VecDeque<u64>,
+    /// Failures since the last healthy run.
+    row: u32,
+}
+
+/// The supervision of one stack.
+#[derive(Debug)]
+pub struct Policy {
+    slots: Vec<Slot>,
+    order: Vec<usize>,
+    stopping: bool,
+    failed: Option<String>,
+    ended: bool,
+    clean_running: bool,
+    clean_again: bool,
+    clean_round: u64,
+    clean_failures: u32,
+    term_grace_ns: u64,
+    out: Vec<Action>,
+}
+
+impl Policy {
+    /// Services in the order of the stack file; `term_grace_ns` passes between SIGTERM and SIGKILL.
+    pub fn new(services: Vec<(String, Rule)>, term_grace_ns: u64) -> Self {
+        let slots: Vec<Slot> = services
+            .into_iter()
+            .map(|(name, rule)| Slot {
+                name,
+                rule,
+                phase: Phase::Idle,
+                generation: 0,
+                since: 0,
+                ready_at: 0,
+                last_sign: 0,
+                recent: VecDeque::new(),
+                row: 0,
+            })
+            .collect();
+        let (recorders, others): (Vec<_>, Vec<_>) = (0..slots.len()).partition(|&i| slots[i].rule.recorder);
+        Self {
+            slots,
+            order: recorders.into_iter().chain(others).collect(),
+            stopping: false,
+            failed: None,
+            ended: false,
+            clean_running: false,
+            clean_again: false,
+            clean_round: 0,
+            clean_failures: 0,
+            term_grace_ns,
+            out: Vec::new(),
+        }
+    }
+
+    pub fn slots(&self) -> &[Slot] {
+        &self.slots
+    }
+    /// Why the stack failed, if it did.
+    pub fn failed(&self) -> Option<&str> {
+        self.failed.as_deref()
+    }
+    pub fn stopping(&self) -> bool {
+        self.stopping
+    }
+    pub fn ended(&self) -> bool {
+        self.ended
+    }
+    /// Takes what is to be done.
+    pub fn take(&mut self) -> Vec<Action> {
+        std::mem::take(&mut self.out)
+    }
+
+    /// Starts every service, recorders first, then in the order of the stack file.
+    pub fn start(&mut self, now: u64) {
+        for service in self.order.clone() {
+            self.spawn(service, now);
+        }
+    }
+
+    fn spawn(&mut self, service: usize, now: u64) {
+        let slot = &mut self.slots[service];
+        slot.generation += 1;
+        slot.phase = Phase::Starting;
+        slot.since = now;
+        slot.ready_at = 0;
+        slot.last_sign = now;
+        let generation = slot.generation;
+        self.out.push(Action::Spawn { service, generation });
+    }
+
+    fn tell(
+        &mut self,
+        service: Option<usize>,
+        kind: EventKind,
+        level: Level,
+        message: String,
+        detail: Value,
+    ) {
+        self.out.push(Action::Tell(Notice { service, kind, level, message, detail }));
+    }
+
+    /// The process exists.
+    pub fn started(&mut self, service: usize, pid: u32) {
+        let generation = self.slots[service].generation;
+        self.tell(
+            Some(service),
+            EventKind::Started,
+            Level::Info,
+            format!("started, pid {pid}"),
+            json!({ "pid": pid, "generation": generation }),
+        );
+    }
+
+    /// A heartbeat was seen.
+    pub fn beat(&mut self, service: usize, generation: u32, state: HealthState, now: u64) {
+        let Some(slot) = self.slots.get_mut(service) else { return };
+        if slot.generation != generation || !slot.phase.alive() {
+            return;
+        }
+        slot.last_sign = now;
+        if slot.phase == Phase::Starting && matches!(state, HealthState::Ready | HealthState::Degraded) {
+            slot.phase = Phase::Running;
+            slot.ready_at = now;
+            let after_ms = now.saturating_sub(slot.since) / 1_000_000;
+            self.tell(
+                Some(service),
+                EventKind::Ready,
+                Level::Info,
+                format!("ready after {after_ms} ms"),
+                json!({ "generation": generation, "after_ms": after_ms }),
+            );
+        }
+    }
+
+    /// All heartbeats up to `now` were read: whoever is silent since too long hangs. The time is the reader's,
+    /// so that a late reader kills nobody.
+    pub fn heartbeats_read(&mut self, now: u64) {
+        if self.stopping {
+            return;
+        }
+        for service in 0..self.slots.len() {
+            let slot = &mut self.slots[service];
+            let (since, limit) = match slot.phase {
+                Phase::Starting => (slot.since, slot.rule.start_timeout_ns),
+                Phase::Running => (slot.last_sign, slot.rule.hang_timeout_ns),
+                _ => continue,
+            };
+            let waited = now.saturating_sub(since);
+            if waited <= limit {
+                continue;
+            }
+            let ms = waited / 1_000_000;
+            let message = if slot.phase == Phase::Starting {
+                format!("not ready {ms} ms after its start: it hangs and is killed")
+            } else {
+                format!("no heartbeat for {ms} ms: it hangs and is killed")
+            };
+            slot.phase = Phase::Aborting { kill_at: now + ABORT_GRACE_NS };
+            self.tell(Some(service), EventKind::Hung, Level::Fault, message, json!({ "waited_ms": ms }));
+            self.out.push(Action::Signal { service, signal: Kill::Abort });
+        }
+    }
+
+    /// The process ended, or could not be started.
+    pub fn died(&mut self, service: usize, death: Death, now: u64) {
+        let slot = &mut self.slots[service];
+        let phase = slot.phase;
+        let ran_ms = now.saturating_sub(slot.since) / 1_000_000;
+        if self.stopping {
+            slot.phase = Phase::Ended;
+            if !matches!(phase, Phase::Stopping { .. }) {
+                self.tell_death(service, death, ran_ms);
+            }
+            self.stop_next(now);
+            return;
+        }
+        let planned = matches!(phase, Phase::Restarting { .. });
+        if !planned {
+            if phase == Phase::Running && now.saturating_sub(slot.ready_at) >= slot.rule.within_ns {
+                slot.row = 0;
+                slot.recent.clear();
+            }
+            slot.row += 1;
+            self.tell_death(service, death, ran_ms);
+        }
+        let round = self.request_clean();
+        self.slots[service].phase = Phase::Cleaning { round, planned };
+    }
+
+    fn tell_death(&mut self, service: usize, death: Death, ran_ms: u64) {
+        let mut detail = death.detail;
+        if let Some(map) = detail.as_object_mut() {
+            map.insert("generation".into(), self.slots[service].generation.into());
+            map.insert("ran_ms".into(), ran_ms.into());
+        }
+        let message = format!("died: {}, after {ran_ms} ms", death.how);
+        self.tell(Some(service), EventKind::Died, Level::Fault, message, detail);
+    }
+
+    /// Asks for a clean-up that begins after this moment; returns its number.
+    fn request_clean(&mut self) -> u64 {
+        if self.clean_running {
+            self.clean_again = true;
+            self.clean_round + 1
+        } else {
+            self.clean_running = true;
+            self.clean_round += 1;
+            self.out.push(Action::Clean);
+            self.clean_round
+        }
+    }
+
+    /// Asks for a clean-up without a death of ours: what a killed command-line tool left.
+    pub fn housekeeping(&mut self) {
+        if !self.stopping && !self.clean_running {
+            self.request_clean();
+        }
+    }
+
+    /// The clean-up ended; an error says why it failed.
+    pub fn clean_done(&mut self, result: Result<(), String>, now: u64) {
+        self.clean_running = false;
+        if self.stopping {
+            return;
+        }
+        if let Err(cause) = result {
+            self.clean_failures += 1;
+            if self.clean_failures >= CLEAN_ATTEMPTS {
+                self.fail(
+                    format!(
+                        "cleaning up after dead processes failed {CLEAN_ATTEMPTS} times in a row ({cause}): the shared \
+                         memory of the stack cannot be trusted any more"
+                    ),
+                    now,
+                );
+                return;
+            }
+            // The services that wait for this round wait for its repetition.
+            self.clean_round -= 1;
+            self.clean_again = false;
+            for slot in &mut self.slots {
+                if let Phase::Cleaning { round, .. } = &mut slot.phase {
+                    *round = self.clean_round + 1;
+                }
+            }
+            self.request_clean();
+            return;
+        }
+        self.clean_failures = 0;
+        let done = self.clean_round;
+        if std::mem::take(&mut self.clean_again) {
+            self.request_clean();
+        }
+        for service in 0..self.slots.len() {
+            if let Phase::Cleaning { round, planned } = self.slots[service].phase
+                && round <= done
+            {
+                if planned {
+                    self.spawn(service, now);
+                } else {
+                    self.decide(service, now);
+                }
+                if self.stopping {
+                    return;
+                }
+            }
+        }
+    }
+
+    /// After a failure: again at once, later, or not at all.
+    fn decide(&mut self, service: usize, now: u64) {
+        let slot = &mut self.slots[service];
+        let rule = slot.rule.clone();
+        while slot.recent.front().is_some_and(|&t| now.saturating_sub(t) > rule.within_ns) {
+            slot.recent.pop_front();
+        }
+        if slot.recent.len() >= rule.max as usize {
+            self.exhausted(service, now);
+            return;
+        }
+        let delay = match slot.row {
+            0 | 1 => 0,
+            n => rule.backoff_first_ns.saturating_mul(1 << (n - 2).min(32)).min(rule.backoff_max_ns),
+        };
+        slot.recent.push_back(now + delay);
+        let count = slot.recent.len();
+        let delay_ms = delay / 1_000_000;
+        let when = if delay == 0 { "at once".to_owned() } else { format!("in {delay_ms} ms") };
+        let message =
+            format!("starting again {when} ({count} of {} restarts in {} s)", rule.max, rule.within_ns / 1_000_000_000);
+        slot.phase = Phase::Waiting { until: now + delay };
+        let next = slot.generation + 1;
+        self.tell(
+            Some(service),
+            EventKind::Restarting,
+            Level::Warning,
+            message,
+            json!({ "delay_ms": delay_ms, "generation": next }),
+        );
+        if delay == 0 {
+            self.spawn(service, now);
+        }
+    }
+
+    fn exhausted(&mut self, service: usize, now: u64) {
+        let slot = &mut self.slots[service];
+        slot.phase = Phase::Held;
+        let within_s = slot.rule.within_ns as f64 / 1e9;
+        let budget = format!("the budget of {} restarts in {within_s} s is used up", slot.rule.max);
+        let (name, on_exhausted) = (slot.name.clone(), slot.rule.on_exhausted);
+        self.out.push(Action::CloseListeners { service });
+        match on_exhausted {
+            Exhausted::Hold => {
+                let message = format!("{budget}: held; `dinrail restart {name}` starts it again");
+                self.tell(Some(service), EventKind::Held, Level::Fault, message, Value::Null);
+            }
+            Exhausted::FailStack => self.fail(format!("service '{name}': {budget}"), now),
+        }
+    }
+
+    /// `restart SERVICE`: costs no budget and ends a hold. Returns the generation that will run.
+    pub fn restart(&mut self, service: usize, now: u64) -> Result<u32, String> {
+        if self.stopping {
+            return Err("the stack is stopping".into());
+        }
+        let grace = self.term_grace_ns;
+        let slot = &mut self.slots[service];
+        let next = slot.generation + 1;
+        match slot.phase {
+            Phase::Starting | Phase::Running => {
+                slot.phase = Phase::Restarting { kill_at: now + grace };
+                let name = slot.name.clone();
+                self.tell(
+                    Some(service),
+                    EventKind::Restarting,
+                    Level::Info,
+                    format!("restarting '{name}' by command"),
+                    json!({ "generation": next }),
+                );
+                self.out.push(Action::Signal { service, signal: Kill::Term });
+            }
+            Phase::Waiting { .. } | Phase::Held => {
+                slot.row = 0;
+                slot.recent.clear();
+                self.spawn(service, now);
+            }
+            _ => return Err(format!("service '{}' is {} already", slot.name, slot.phase.word())),
+        }
+        Ok(next)
+    }
+
+    /// Deadlines that have passed by `now`.
+    pub fn tick(&mut self, now: u64) {
+        for service in 0..self.slots.len() {
+            match self.slots[service].phase {
+                Phase::Aborting { kill_at } if now >= kill_at => {
+                    self.slots[service].phase = Phase::Killed;
+                    self.out.push(Action::Signal { service, signal: Kill::Kill });
+                }
+                Phase::Restarting { kill_at } if now >= kill_at => {
+                    self.slots[service].phase = Phase::Restarting { kill_at: u64::MAX };
+                    self.out.push(Action::Signal { service, signal: Kill::Kill });
+                }
+                Phase::Stopping { kill_at } if now >= kill_at => {
+                    self.slots[service].phase = Phase::Stopping { kill_at: u64::MAX };
+                    let message = format!("did not end within {} ms of SIGTERM: killed", self.term_grace_ns / 1_000_000);
+                    self.tell(Some(service), EventKind::Hung, Level::Warning, message, Value::Null);
+                    self.out.push(Action::Signal { service, signal: Kill::Kill });
+                }
+                Phase::Waiting { until } if now >= until && !self.stopping => self.spawn(service, now),
+                _ => {}
+            }
+        }
+    }
+
+    /// When [`Self::tick`] has something to do next.
+    pub fn next_deadline(&self) -> Option<u64> {
+        let due = |slot: &Slot| match slot.phase {
+            Phase::Aborting { kill_at } | Phase::Restarting { kill_at } | Phase::Stopping { kill_at } => {
+                Some(kill_at)
+            }
+            Phase::Waiting { until } => Some(until),
+            _ => None,
+        };
+        self.slots.iter().filter_map(due).filter(|&t| t != u64::MAX).min()
+    }
+
+    /// Ends the stack: one service after the other, in reverse order. Asked a second time, kills what is left.
+    pub fn stop(&mut self, why: &str, now: u64) {
+        if self.stopping {
+            for service in 0..self.slots.len() {
+                if self.slots[service].phase.alive() {
+                    self.slots[service].phase = Phase::Stopping { kill_at: u64::MAX };
+                    self.out.push(Action::Signal { service, signal: Kill::Kill });
+                }
+            }
+            return;
+        }
+        self.tell(None, EventKind::Stopping, Level::Info, format!("stopping: {why}"), Value::Null);
+        self.begin_stop(now);
+    }
+
+    /// Ends the stack as failed: exit code 1.
+    pub fn fail(&mut self, why: String, now: u64) {
+        if self.failed.is_none() {
+            self.tell(None, EventKind::StackFailed, Level::Fault, why.clone(), Value::Null);
+            self.failed = Some(why);
+        }
+        if !self.stopping {
+            self.begin_stop(now);
+        }
+    }
+
+    fn begin_stop(&mut self, now: u64) {
+        self.stopping = true;
+        self.stop_next(now);
+    }
+
+    fn stop_next(&mut self, now: u64) {
+        let grace = self.term_grace_ns;
+        for service in self.order.clone().into_iter().rev() {
+            let slot = &mut self.slots[service];
+            match slot.phase {
+                Phase::Ended => {}
+                Phase::Stopping { .. } => return,
+                phase if phase.alive() => {
+                    slot.phase = Phase::Stopping { kill_at: now + grace };
+                    self.out.push(Action::Signal { service, signal: Kill::Term });
+                    return;
+                }
+                // A held one stays visible as held: the stack did not end healthy.
+                Phase::Held => {}
+                _ => slot.phase = Phase::Ended,
+            }
+        }
+        if !self.ended {
+            self.ended = true;
+            self.out.push(Action::Ended);
+        }
+    }
+}

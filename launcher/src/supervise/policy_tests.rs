@@ -1,0 +1,333 @@
+//! Supervision in virtual time.
+
+use super::policy::*;
+use ipc_types::event::EventKind;
+use ipc_types::payload::HealthState;
+use proptest::prelude::*;
+
+const MS: u64 = 1_000_000;
+const S: u64 = 1_000_000_000;
+
+fn policy(rules: Vec<Rule>) -> Policy {
+    let names = ["can0", "plc", "rec", "modbus"];
+    Policy::new(rules.into_iter().zip(names).map(|(r, n)| (n.to_owned(), r)).collect(), TERM_GRACE_NS)
+}
+
+fn death() -> Death {
+    Death { how: "killed by SIGKILL".into(), detail: serde_json::json!({ "signal": "SIGKILL" }) }
+}
+
+/// What was done, without the events.
+fn done(policy: &mut Policy) -> Vec<Action> {
+    policy.take().into_iter().filter(|a| !matches!(a, Action::Tell(_))).collect()
+}
+
+fn told(policy: &mut Policy) -> Vec<EventKind> {
+    let tell = |a| match a {
+        Action::Tell(notice) => Some(notice.kind),
+        _ => None,
+    };
+    policy.take().into_iter().filter_map(tell).collect()
+}
+
+fn running(rules: Vec<Rule>) -> Policy {
+    let mut p = policy(rules);
+    p.start(0);
+    for i in 0..p.slots().len() {
+        p.beat(i, 1, HealthState::Ready, 10 * MS);
+    }
+    p.take();
+    p
+}
+
+#[test]
+fn recorders_start_first_and_stop_last() {
+    let rec = Rule { recorder: true, ..Rule::default() };
+    let mut p = policy(vec![Rule::default(), Rule::default(), rec, Rule::default()]);
+    p.start(0);
+    let order: Vec<usize> = done(&mut p)
+        .iter()
+        .map(|a| match a {
+            Action::Spawn { service, generation: 1 } => *service,
+            other => panic!("{other:?}"),
+        })
+        .collect();
+    assert_eq!(order, [2, 0, 1, 3]);
+    p.stop("asked", S);
+    for service in [3, 1, 0, 2] {
+        assert_eq!(done(&mut p), [Action::Signal { service, signal: Kill::Term }]);
+        p.died(service, death(), S);
+    }
+    assert_eq!(done(&mut p), [Action::Ended]);
+    assert!(p.ended() && p.failed().is_none());
+}
+
+#[test]
+fn the_first_restart_is_at_once_then_the_delay_doubles_until_the_budget_is_used_up() {
+    let mut p = running(vec![Rule::default(), Rule::default()]);
+    let mut now = S;
+    let mut delays = Vec::new();
+    for generation in 2..=6 {
+        p.died(0, death(), now);
+        assert_eq!(done(&mut p), [Action::Clean]);
+        p.clean_done(Ok(()), now);
+        let due = p.next_deadline();
+        delays.push(due.map_or(0, |t| (t - now) / MS));
+        if let Some(t) = due {
+            assert!(done(&mut p).is_empty());
+            p.tick(t - 1);
+            assert!(done(&mut p).is_empty());
+            now = t;
+            p.tick(now);
+        }
+        assert_eq!(done(&mut p), [Action::Spawn { service: 0, generation }]);
+        p.beat(0, generation, HealthState::Ready, now);
+        p.take();
+    }
+    assert_eq!(delays, [0, 50, 100, 200, 400]);
+    p.died(0, death(), now);
+    p.clean_done(Ok(()), now);
+    let all = p.take();
+    assert!(all.contains(&Action::CloseListeners { service: 0 }));
+    assert!(all.iter().any(|a| matches!(a, Action::Tell(n) if n.kind == EventKind::Held)));
+    assert_eq!(p.slots()[0].phase, Phase::Held);
+    assert_eq!(p.slots()[1].phase, Phase::Running, "the neighbour works on");
+    // A restart by hand ends the hold and the budget is fresh.
+    assert_eq!(p.restart(0, now), Ok(7));
+    assert_eq!(done(&mut p), [Action::Spawn { service: 0, generation: 7 }]);
+    p.died(0, death(), now);
+    p.clean_done(Ok(()), now);
+    assert!(done(&mut p).contains(&Action::Spawn { service: 0, generation: 8 }));
+}
+
+#[test]
+fn a_healthy_run_resets_the_budget() {
+    let mut p = running(vec![Rule { max: 1, ..Rule::default() }]);
+    let mut now = 11 * S;
+    for generation in 2..20 {
+        p.died(0, death(), now);
+        p.clean_done(Ok(()), now);
+        assert!(done(&mut p).contains(&Action::Spawn { service: 0, generation }));
+        p.beat(0, generation, HealthState::Ready, now);
+        now += 10 * S;
+    }
+}
+
+#[test]
+fn an_exhausted_budget_can_fail_the_stack() {
+    let rule = Rule { max: 0, on_exhausted: Exhausted::FailStack, ..Rule::default() };
+    let mut p = running(vec![rule, Rule::default()]);
+    p.died(0, death(), S);
+    p.clean_done(Ok(()), S);
+    assert_eq!(
+        done(&mut p),
+        [
+            Action::Clean,
+            Action::CloseListeners { service: 0 },
+            Action::Signal { service: 1, signal: Kill::Term }
+        ]
+    );
+    p.died(1, death(), S);
+    assert_eq!(done(&mut p), [Action::Ended]);
+    assert_eq!(p.failed(), Some("service 'can0': the budget of 0 restarts in 10 s is used up"));
+}
+
+#[test]
+fn silence_is_a_hang_then_sigabrt_then_sigkill() {
+    let mut p = running(vec![Rule { hang_timeout_ns: S, ..Rule::default() }]);
+    p.heartbeats_read(S + 10 * MS);
+    assert!(p.take().is_empty());
+    p.heartbeats_read(S + 11 * MS);
+    assert_eq!(done(&mut p), [Action::Signal { service: 0, signal: Kill::Abort }]);
+    p.heartbeats_read(S + 20 * MS);
+    assert!(p.take().is_empty(), "once");
+    p.tick(S + 511 * MS);
+    assert_eq!(done(&mut p), [Action::Signal { service: 0, signal: Kill::Kill }]);
+    p.died(0, death(), S + 512 * MS);
+    p.clean_done(Ok(()), S + 520 * MS);
+    assert_eq!(done(&mut p), [Action::Clean, Action::Spawn { service: 0, generation: 2 }]);
+}
+
+#[test]
+fn a_starting_service_may_be_silent_for_longer_and_old_generations_do_not_count() {
+    let mut p = policy(vec![Rule { hang_timeout_ns: S, ..Rule::default() }]);
+    p.start(0);
+    p.heartbeats_read(10 * S);
+    assert!(p.slots()[0].phase == Phase::Starting);
+    p.beat(0, 0, HealthState::Ready, 10 * S);
+    assert!(p.slots()[0].phase == Phase::Starting);
+    p.take();
+    p.heartbeats_read(10 * S + 1);
+    assert_eq!(told(&mut p), [EventKind::Hung]);
+}
+
+#[test]
+fn one_clean_up_serves_all_who_died_before_it_began() {
+    let mut p = running(vec![Rule::default(), Rule::default(), Rule::default()]);
+    p.died(0, death(), S);
+    p.died(1, death(), S);
+    assert_eq!(done(&mut p), [Action::Clean], "one at a time");
+    p.clean_done(Ok(()), S);
+    // Service 1 died while the first was on its way: it waits for the second.
+    assert_eq!(done(&mut p), [Action::Clean, Action::Spawn { service: 0, generation: 2 }]);
+    p.clean_done(Ok(()), S);
+    assert_eq!(done(&mut p), [Action::Spawn { service: 1, generation: 2 }]);
+}
+
+#[test]
+fn three_failed_clean_ups_fail_the_stack() {
+    let mut p = running(vec![Rule::default(), Rule::default()]);
+    p.died(0, death(), S);
+    for _ in 0..2 {
+        assert_eq!(done(&mut p), [Action::Clean]);
+        p.clean_done(Err("no answer within 2 s".into()), S);
+    }
+    assert_eq!(done(&mut p), [Action::Clean]);
+    p.clean_done(Err("no answer within 2 s".into()), S);
+    assert_eq!(done(&mut p), [Action::Signal { service: 1, signal: Kill::Term }]);
+    assert!(p.failed().is_some_and(|why| why.contains("3 times in a row (no answer within 2 s)")));
+}
+
+#[test]
+fn a_failed_clean_up_is_forgotten_after_a_good_one() {
+    let mut p = running(vec![Rule { max: 100, ..Rule::default() }]);
+    for generation in 2..6 {
+        p.died(0, death(), S);
+        p.clean_done(Err("x".into()), S);
+        p.clean_done(Err("x".into()), S);
+        p.clean_done(Ok(()), S);
+        if let Some(t) = p.next_deadline() {
+            p.tick(t);
+        }
+        assert!(done(&mut p).contains(&Action::Spawn { service: 0, generation }));
+    }
+}
+
+#[test]
+fn restart_by_command_costs_no_budget_and_is_no_fault() {
+    let mut p = running(vec![Rule { max: 0, ..Rule::default() }]);
+    assert_eq!(p.restart(0, S), Ok(2));
+    assert!(p.restart(0, S).is_err(), "not twice");
+    p.tick(S + TERM_GRACE_NS);
+    assert_eq!(
+        done(&mut p),
+        [
+            Action::Signal { service: 0, signal: Kill::Term },
+            Action::Signal { service: 0, signal: Kill::Kill }
+        ]
+    );
+    p.died(0, death(), S);
+    p.clean_done(Ok(()), S);
+    let all = p.take();
+    assert!(all.contains(&Action::Spawn { service: 0, generation: 2 }));
+    assert!(!all.iter().any(|a| matches!(a, Action::Tell(n) if n.kind == EventKind::Died)));
+}
+
+#[test]
+fn who_ignores_sigterm_at_the_end_is_killed_and_a_second_stop_kills_all() {
+    let mut p = running(vec![Rule::default(), Rule::default()]);
+    p.stop("asked", S);
+    p.tick(S + TERM_GRACE_NS);
+    assert_eq!(
+        done(&mut p),
+        [
+            Action::Signal { service: 1, signal: Kill::Term },
+            Action::Signal { service: 1, signal: Kill::Kill }
+        ]
+    );
+    p.stop("asked", S);
+    assert_eq!(
+        done(&mut p),
+        [
+            Action::Signal { service: 0, signal: Kill::Kill },
+            Action::Signal { service: 1, signal: Kill::Kill }
+        ]
+    );
+    p.died(0, death(), S);
+    p.died(1, death(), S);
+    assert_eq!(done(&mut p), [Action::Ended]);
+}
+
+#[test]
+fn a_stop_ends_back_off_and_clean_up() {
+    let mut p = running(vec![Rule::default(), Rule::default()]);
+    p.died(0, death(), S);
+    p.died(1, death(), S);
+    p.take();
+    p.stop("asked", S);
+    assert_eq!(done(&mut p), [Action::Ended]);
+    p.clean_done(Err("late".into()), S);
+    p.tick(100 * S);
+    assert!(done(&mut p).is_empty());
+}
+
+proptest! {
+    /// Whatever happens in whatever order: at most one process a service, one clean-up at a time, generations
+    /// count up by one, and a stop always comes to its end.
+    #[test]
+    fn nothing_is_started_twice_and_every_stack_ends(
+        events in proptest::collection::vec((0u8..8, 0usize..3, 0u64..3 * S), 0..200)
+    ) {
+        let rules = vec![Rule::default(), Rule { max: 2, ..Rule::default() }, Rule { recorder: true, ..Rule::default() }];
+        let mut p = policy(rules);
+        let mut alive = [false; 3];
+        let mut generation = [0u32; 3];
+        let mut cleaning = false;
+        let mut ended = 0;
+        let mut now = 0;
+        p.start(now);
+        let mut check = |p: &mut Policy, alive: &mut [bool; 3], cleaning: &mut bool| {
+            for action in p.take() {
+                match action {
+                    Action::Spawn { service, generation: g } => {
+                        assert!(!alive[service], "second process");
+                        assert_eq!(g, generation[service] + 1);
+                        generation[service] = g;
+                        alive[service] = true;
+                    }
+                    Action::Signal { service, .. } => assert!(alive[service]),
+                    Action::Clean => {
+                        assert!(!*cleaning, "second clean-up");
+                        *cleaning = true;
+                    }
+                    Action::Ended => ended += 1,
+                    Action::CloseListeners { .. } | Action::Tell(_) => {}
+                }
+            }
+            assert!(ended <= 1);
+        };
+        check(&mut p, &mut alive, &mut cleaning);
+        for (what, service, dt) in events {
+            now += dt;
+            match what {
+                0 | 1 if alive[service] => {
+                    alive[service] = false;
+                    p.died(service, death(), now);
+                }
+                2 | 3 if cleaning => {
+                    cleaning = false;
+                    p.clean_done(if what == 2 { Ok(()) } else { Err("x".into()) }, now);
+                }
+                4 => p.beat(service, p.slots()[service].generation, HealthState::Ready, now),
+                5 => p.heartbeats_read(now),
+                6 => { let _ = p.restart(service, now); }
+                7 => p.housekeeping(),
+                _ => p.tick(now),
+            }
+            check(&mut p, &mut alive, &mut cleaning);
+        }
+        p.stop("end", now);
+        check(&mut p, &mut alive, &mut cleaning);
+        for _ in 0..3 {
+            for service in 0..3 {
+                if alive[service] && matches!(p.slots()[service].phase, Phase::Stopping { .. }) {
+                    alive[service] = false;
+                    p.died(service, death(), now);
+                    check(&mut p, &mut alive, &mut cleaning);
+                }
+            }
+        }
+        prop_assert!(p.ended());
+        prop_assert_eq!(alive, [false; 3]);
+    }
+}

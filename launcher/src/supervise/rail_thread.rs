@@ -1,0 +1,208 @@
+//! The launcher's own place on the rail: creates and holds every topic, publishes events, reads heartbeats.
+//!
+//! All of it lives in one helper thread, because a call into the middleware may hang on what a killed process
+//! left. The main thread talks to it through channels and an eventfd, counts its turns, and never waits for it.
+
+use super::watch::{Observed, Observer};
+use ipc_types::context::Context;
+use ipc_types::event::{EventBody, EventKind, Level};
+use ipc_types::payload::{Event, Health, HealthState};
+use ipc_types::port::{Publisher, Subscriber};
+use ipc_types::rail::{self, Held, RailError};
+use ipc_types::reactor::Reactor;
+use ipc_types::topic::{EVENTS, TopicKind};
+use ipc_types::{Stack, clock};
+use rustix::event::{EventfdFlags, eventfd};
+use serde_json::Value;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
+use std::time::Duration;
+
+/// Heartbeats and orders are looked at so often.
+const TURN: Duration = Duration::from_millis(20);
+/// Orders that may wait.
+const ORDERS_MAX: usize = 1024;
+/// Longest message and detail of an event in bytes.
+const EVENT_MESSAGE_MAX: usize = 1024;
+
+/// What the main thread asks for.
+#[derive(Debug)]
+pub enum Order {
+    /// Publish an event.
+    Tell { service: String, kind: EventKind, level: Level, message: String, detail: Value },
+    /// Let go of everything and end.
+    Quit,
+}
+
+/// A heartbeat that was seen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Beat {
+    pub service: usize,
+    pub generation: u32,
+    pub state: HealthState,
+}
+
+/// What the main thread is told.
+#[derive(Debug)]
+pub enum Report {
+    /// Every topic exists.
+    Up,
+    /// The rail could not be made.
+    Failed(String),
+    /// All heartbeats up to `t_ns` were read.
+    Turn { t_ns: u64, beats: Vec<Beat>, observed: Option<Box<Observed>> },
+    /// Something for the launcher's log.
+    Trouble(String),
+}
+
+/// The main thread's end.
+pub struct RailHandle {
+    orders: SyncSender<Order>,
+    order_bell: Arc<OwnedFd>,
+    pub reports: Receiver<Report>,
+    report_bell: Arc<OwnedFd>,
+    thread: std::thread::JoinHandle<()>,
+}
+
+impl RailHandle {
+    /// Starts the thread. The first report is [`Report::Up`] or [`Report::Failed`].
+    pub fn start(stack: Stack, observe: bool) -> std::io::Result<Self> {
+        let flags = EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK;
+        let (order_bell, report_bell) = (Arc::new(eventfd(0, flags)?), Arc::new(eventfd(0, flags)?));
+        let (orders, incoming) = sync_channel(ORDERS_MAX);
+        let (outgoing, reports) = channel();
+        let mut out = Outgoing { reports: outgoing, bell: report_bell.clone() };
+        let bell = order_bell.clone();
+        let thread = std::thread::Builder::new().name("rail".into()).spawn(move || {
+            if let Err(e) = serve(&stack, observe, &incoming, &bell, &mut out) {
+                out.send(Report::Failed(e.to_string()));
+            }
+        })?;
+        Ok(Self { orders, order_bell, reports, report_bell, thread })
+    }
+
+    /// Readable when reports wait.
+    pub fn bell(&self) -> BorrowedFd<'_> {
+        self.report_bell.as_fd()
+    }
+
+    /// Resets the bell; take all reports after it.
+    pub fn drain_bell(&self) {
+        let _ = rustix::io::read(&*self.report_bell, &mut [0u8; 8]);
+    }
+
+    /// Hands over an order without waiting; `false` when the thread does not take any more.
+    pub fn order(&self, order: Order) -> bool {
+        let taken = self.orders.try_send(order).is_ok();
+        ring(&self.order_bell);
+        taken
+    }
+
+    /// Whether the thread has ended.
+    pub fn ended(&self) -> bool {
+        self.thread.is_finished()
+    }
+}
+
+fn ring(bell: &OwnedFd) {
+    let _ = rustix::io::write(bell, &1u64.to_ne_bytes());
+}
+
+struct Outgoing {
+    reports: Sender<Report>,
+    bell: Arc<OwnedFd>,
+}
+
+impl Outgoing {
+    fn send(&mut self, report: Report) {
+        let _ = self.reports.send(report);
+        ring(&self.bell);
+    }
+}
+
+/// Health topic of one service.
+struct Pulse {
+    health: Subscriber<Health>,
+    writer: u32,
+}
+
+fn serve(
+    stack: &Stack,
+    observe: bool,
+    orders: &Receiver<Order>,
+    bell: &OwnedFd,
+    out: &mut Outgoing,
+) -> Result<(), RailError> {
+    rail::join(&stack.root)?;
+    let node = rail::node("launcher")?;
+    let mut held: Vec<Held> = Vec::with_capacity(stack.topics.len() + stack.services.len());
+    for topic in &stack.topics {
+        held.push(rail::create_topic(&node, topic)?);
+    }
+    for service in &stack.services {
+        held.push(rail::create_inbox(&node, &service.name, stack.services.len() as u32)?);
+    }
+    let mut ctx = Context::observer(&stack.root)?;
+    // The launcher is writer 0 of the rail.
+    ctx.service = "launcher".to_owned();
+    ctx.writer = 0;
+    let mut events = ctx.publisher::<Event>(EVENTS)?;
+    let mut pulses = Vec::with_capacity(stack.services.len());
+    for service in &stack.services {
+        let health = ctx.subscriber::<Health>(&TopicKind::Health.of(&service.name))?;
+        pulses.push(Pulse { health, writer: service.index });
+    }
+    let mut observer = Observer::new(&ctx, observe)?;
+    out.send(Report::Up);
+
+    let mut reactor = Reactor::new()?;
+    reactor.add(bell.as_fd())?;
+    reactor.add_timer(TURN)?;
+    let mut beats = Vec::new();
+    let mut trouble_told = false;
+    loop {
+        reactor.wait(Some(Duration::from_secs(1)))?;
+        let _ = rustix::io::read(bell, &mut [0u8; 8]);
+        for order in orders.try_iter() {
+            match order {
+                Order::Tell { service, kind, level, message, detail } => {
+                    let body = EventBody::now(kind, level, &service, message, detail);
+                    if let Err(e) = publish(&mut events, body)
+                        && !std::mem::replace(&mut trouble_told, true)
+                    {
+                        out.send(Report::Trouble(format!("an event could not be published: {e}")));
+                    }
+                }
+                Order::Quit => {
+                    // What services said last, the recorder above all.
+                    let observed = observer.look(true).map(Box::new);
+                    out.send(Report::Turn { t_ns: clock::mono_ns(), beats: Vec::new(), observed });
+                    return Ok(());
+                }
+            }
+        }
+        for (service, pulse) in pulses.iter_mut().enumerate() {
+            pulse.health.newest(|health, _| {
+                if health.stamp.writer == pulse.writer {
+                    let state = HealthState::from_u32(health.state);
+                    beats.push(Beat { service, generation: health.stamp.generation, state });
+                }
+            });
+        }
+        let observed = observer.look(false).map(Box::new);
+        out.send(Report::Turn { t_ns: clock::mono_ns(), beats: std::mem::take(&mut beats), observed });
+    }
+}
+
+fn publish(events: &mut Publisher<Event>, mut body: EventBody) -> Result<(), String> {
+    body.message.truncate(body.message.floor_char_boundary(EVENT_MESSAGE_MAX));
+    let mut text = serde_json::to_vec(&body).map_err(|e| e.to_string())?;
+    if text.len() > events.max_tail() as usize {
+        body.detail = serde_json::json!("left out: too long");
+        text = serde_json::to_vec(&body).map_err(|e| e.to_string())?;
+    }
+    events.send_tail(Event::default(), &text).map_err(|e| e.to_string())?;
+    events.ring();
+    Ok(())
+}

@@ -1,0 +1,70 @@
+//! What the operating system offers only through raw calls: the scheduler and inherited descriptors.
+//!
+//! The only module of the launcher with `unsafe`.
+#![allow(unsafe_code)]
+
+use std::io;
+use std::os::fd::{FromRawFd, OwnedFd, RawFd};
+
+/// Puts this process under SCHED_FIFO; threads that it starts later inherit it. Priority 1 to 99.
+pub fn set_fifo(priority: u32) -> io::Result<()> {
+    let param = libc::sched_param { sched_priority: priority as i32 };
+    // SAFETY: 0 names the calling process; the pointer is to a live local that the kernel only reads.
+    if unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const param) } == 0 {
+        Ok(())
+    } else {
+        Err(io::Error::last_os_error())
+    }
+}
+
+/// Takes over a descriptor that the parent process passed by number.
+///
+/// Refuses 0-2 and numbers that are not open. Each number may be taken once in the life of a process, before
+/// anything else opens descriptors: the caller is the very beginning of `__service`.
+pub fn take_inherited(number: RawFd) -> io::Result<OwnedFd> {
+    if number <= 2 {
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "0, 1 and 2 are standard streams"));
+    }
+    // SAFETY: F_GETFD and F_SETFD touch no memory; an invalid number is answered with EBADF.
+    let flags = unsafe { libc::fcntl(number, libc::F_GETFD) };
+    if flags < 0 {
+        return Err(io::Error::last_os_error());
+    }
+    // SAFETY: as above.
+    if unsafe { libc::fcntl(number, libc::F_SETFD, flags | libc::FD_CLOEXEC) } < 0 {
+        return Err(io::Error::last_os_error());
+    }
+    // SAFETY: open (checked above), and by the contract above nobody else in this process owns it.
+    Ok(unsafe { OwnedFd::from_raw_fd(number) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::fd::{AsRawFd, IntoRawFd};
+
+    #[test]
+    fn an_inherited_descriptor_is_taken_and_closed_on_exec_again() {
+        let (reader, writer) = rustix::pipe::pipe().unwrap();
+        rustix::io::fcntl_setfd(&reader, rustix::io::FdFlags::empty()).unwrap();
+        let number = reader.into_raw_fd();
+        let taken = take_inherited(number).unwrap();
+        assert_eq!(taken.as_raw_fd(), number);
+        assert!(rustix::io::fcntl_getfd(&taken).unwrap().contains(rustix::io::FdFlags::CLOEXEC));
+        rustix::io::write(&writer, b"x").unwrap();
+        let mut byte = [0u8; 1];
+        assert_eq!(rustix::io::read(&taken, &mut byte).unwrap(), 1);
+    }
+
+    #[test]
+    fn standard_streams_and_closed_numbers_are_refused() {
+        for number in [-1, 0, 1, 2, 1_000_000] {
+            assert!(take_inherited(number).is_err(), "{number}");
+        }
+    }
+
+    #[test]
+    fn a_priority_outside_the_range_is_refused() {
+        assert!(set_fifo(1000).is_err());
+    }
+}

@@ -1,0 +1,257 @@
+//! The service on a whole rail in one process: the service on a thread, bus driver and PLC played by the test.
+//! One test function, because a process belongs to one rail for its whole life.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may end like this")]
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use ipc_types::payload::{CanFrame, Event, Health, HealthState, Image, Inputs, PlcState, Quality, can_flag};
+use ipc_types::port::{Publisher, SendError, Subscriber};
+use ipc_types::stack::{ServiceEntry, Stack, TopicEntry, Wake};
+use ipc_types::topic::{EVENTS, TopicKind};
+use ipc_types::wiring::Neighbours;
+use ipc_types::{Context, Wiring, rail};
+use serde_json::json;
+
+/// Longest wait for anything; never a measure of speed.
+const PATIENCE: Duration = Duration::from_mins(1);
+const GOOD: u8 = Quality::Good as u8;
+const STALE: u8 = Quality::Stale as u8;
+const NO_DATA: u8 = Quality::NoData as u8;
+
+fn topic(kind: TopicKind, service: &str, max_tail: u32, wake: Option<&str>) -> TopicEntry {
+    let (max_publishers, max_subscribers) = rail::port_limits(kind, 2, 2);
+    TopicEntry {
+        name: if kind == TopicKind::Events { EVENTS.to_owned() } else { kind.of(service) },
+        kind,
+        depth: kind.row().depth,
+        max_tail,
+        writers: vec![service.to_owned()],
+        readers: Vec::new(),
+        wakes: wake.map(|w| Wake { service: w.into(), event_id: 1 }).into_iter().collect(),
+        max_publishers,
+        max_subscribers,
+    }
+}
+
+struct Wipe(PathBuf, String);
+impl Drop for Wipe {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+        for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
+            if entry.file_name().to_string_lossy().starts_with(&self.1) {
+                let _ = std::fs::remove_file(entry.path());
+            }
+        }
+    }
+}
+
+/// Tries again until it gives something.
+fn wait<T>(what: &str, mut attempt: impl FnMut() -> Option<T>) -> T {
+    let end = Instant::now() + PATIENCE;
+    loop {
+        if let Some(result) = attempt() {
+            return result;
+        }
+        assert!(Instant::now() < end, "{what} never came");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+struct Plc {
+    port: Publisher<Image>,
+    scan: u64,
+}
+
+impl Plc {
+    fn image(&mut self, state: PlcState, outputs: &[u8]) {
+        self.scan += 1;
+        let image = Image {
+            scan: self.scan,
+            state: state as u32,
+            output_bytes: outputs.len() as u32,
+            ..Image::default()
+        };
+        self.port.send_tail(image, outputs).unwrap();
+        self.port.ring();
+    }
+}
+
+fn events(port: &mut Subscriber<Event>, kind: &str) -> Option<String> {
+    let mut found = None;
+    port.drain(64, |_, tail| {
+        let body: serde_json::Value = serde_json::from_slice(tail).unwrap();
+        if body["event"] == kind {
+            found = Some(body["message"].as_str().unwrap().to_owned());
+        }
+    });
+    found
+}
+
+#[test]
+fn frames_and_image() {
+    let name = format!("caniotest{}", std::process::id());
+    let (root, prefix) = rail::place(0, &name);
+    let _wipe = Wipe(root.clone(), prefix.clone());
+    std::fs::create_dir_all(&root).unwrap();
+    std::fs::write(root.join(rail::CONFIG_FILE), rail::config_text(&root, &prefix)).unwrap();
+    let config = json!({
+        "in": [
+            { "id": 0x1A0, "start": 0, "len": 16, "to": "%IW0", "symbol": "Speed", "timeout": "2s" },
+            { "id": "18FEF100", "start": 3, "len": 1, "to": "%IX2.5" },
+        ],
+        "out": [
+            { "id": 0x210, "dlc": 2, "mode": "cyclic", "period": "20ms",
+              "signals": [{ "start": 0, "len": 16, "from": "%QW0" }] },
+            { "id": 0x211, "dlc": 1, "mode": "on_change", "signals": [{ "start": 7, "len": 1, "from": "%QX2.0" }] },
+        ],
+        "stale_after": "500ms",
+    });
+    let services =
+        vec![("can0".into(), "can".into()), ("io".into(), "can-io".into()), ("plc".into(), "plc".into())];
+    let neighbours = Neighbours { name: "io".into(), services, dir: ".".into() };
+    let wiring = dinrail_can_io::topics(&serde_json::from_value(config.clone()).unwrap(), &neighbours);
+    let tail = wiring.topics[0].max_tail;
+    let service = |name: &str, index, config, wiring| ServiceEntry {
+        name: name.into(),
+        kind: "x".into(),
+        index,
+        config,
+        wiring,
+    };
+    let stack = Stack {
+        name,
+        file: "test".into(),
+        dir: ".".into(),
+        text: String::new(),
+        build_id: "test".into(),
+        root: root.clone(),
+        prefix,
+        services: vec![
+            service("io", 1, config, wiring),
+            service("probe", 2, serde_json::Value::Null, Wiring::default()),
+        ],
+        topics: vec![
+            topic(TopicKind::Events, "stack", 8192, None),
+            topic(TopicKind::Health, "io", 0, None),
+            topic(TopicKind::Status, "io", 16384, None),
+            topic(TopicKind::Health, "probe", 0, None),
+            topic(TopicKind::Status, "probe", 16384, None),
+            topic(TopicKind::CanRx, "can0", 0, Some("io")),
+            topic(TopicKind::CanTx, "can0", 0, None),
+            topic(TopicKind::Image, "plc", 64, Some("io")),
+            topic(TopicKind::Inputs, "io", tail, None),
+        ],
+    };
+    std::fs::write(root.join(rail::STACK_FILE), serde_json::to_vec(&stack).unwrap()).unwrap();
+    rail::join(&root).unwrap();
+    let launcher = rail::node("launcher").unwrap();
+    let mut held: Vec<_> = stack.topics.iter().map(|t| rail::create_topic(&launcher, t).unwrap()).collect();
+    held.push(rail::create_inbox(&launcher, "io", 4).unwrap());
+
+    let mut ctx = Context::service(&root, "probe", 1, BTreeMap::new()).unwrap();
+    let mut health = ctx.subscriber::<Health>("io/health").unwrap();
+    let mut events_port = ctx.subscriber::<Event>(EVENTS).unwrap();
+    let mut inputs = ctx.subscriber::<Inputs>("io/inputs").unwrap();
+    let mut tx = ctx.subscriber::<CanFrame>("can0/tx").unwrap();
+    let mut rx = ctx.publisher::<CanFrame>("can0/rx").unwrap();
+    let mut plc = Plc { port: ctx.publisher("plc/image").unwrap(), scan: 0 };
+    std::thread::spawn(move || {
+        let ctx = Context::service(&root, "io", 1, BTreeMap::new()).unwrap();
+        dinrail_can_io::run(ctx).unwrap();
+    });
+    wait("readiness", || {
+        let mut ready = false;
+        health.newest(|h, _| ready = h.state == HealthState::Ready as u32);
+        ready.then_some(())
+    });
+
+    // In: no data, then values; echoes and remote frames are not taken.
+    let mut tail_is = |expected: &[u8]| {
+        let mut seen = false;
+        wait(&format!("inputs {expected:?}"), || {
+            inputs.drain(64, |header, tail| {
+                assert_eq!(header.ranges, 2);
+                seen |= tail == expected;
+            });
+            seen.then_some(())
+        });
+    };
+    tail_is(&[0, 0, 0, NO_DATA, NO_DATA]);
+    let mut bus = |frame: CanFrame| {
+        rx.send(frame).unwrap();
+        rx.ring();
+    };
+    bus(CanFrame::classic(0x18FE_F100, &[8]));
+    tail_is(&[0, 0, 1, NO_DATA, GOOD]);
+    bus(CanFrame { flags: can_flag::TX_ECHO, ..CanFrame::classic(0x18FE_F100, &[0]) });
+    bus(CanFrame::classic(0x1A0, &[0x34, 0x12]));
+    tail_is(&[0x34, 0x12, 1, GOOD, GOOD]);
+    // The value is held and marked, and it is told.
+    tail_is(&[0x34, 0x12, 1, STALE, GOOD]);
+    let message = wait("the event", || events(&mut events_port, "input_quality"));
+    assert!(
+        message.starts_with("frame 1A0h has not come for ") && message.ends_with("Speed is stale"),
+        "{message}"
+    );
+    bus(CanFrame::classic(0x1A0, &[0x35, 0x12]));
+    tail_is(&[0x35, 0x12, 1, GOOD, GOOD]);
+
+    // Out: nothing before the first image of a running program.
+    let mut sent = Vec::new();
+    let mut take = |sent: &mut Vec<(u32, Vec<u8>, u8)>| {
+        tx.drain(1024, |f, _| sent.push((f.can_id, f.payload().to_vec(), f.flags)));
+        sent.len()
+    };
+    plc.image(PlcState::Starting, &[9, 9, 1]);
+    std::thread::sleep(Duration::from_millis(100));
+    assert_eq!(take(&mut sent), 0);
+    plc.image(PlcState::Run, &[0x78, 0x56, 1]);
+    let cyclic = (0x210, vec![0x78, 0x56], can_flag::NEWEST);
+    wait("frames", || {
+        plc.image(PlcState::Run, &[0x78, 0x56, 1]);
+        take(&mut sent);
+        (sent.iter().filter(|f| **f == cyclic).count() >= 3).then_some(())
+    });
+    assert_eq!(sent.iter().filter(|f| f.0 == 0x211).collect::<Vec<_>>(), [&(0x211, vec![0x80], 0)]);
+
+    // A stale image silences.
+    let message = wait("the safe state", || events(&mut events_port, "safe_entered"));
+    assert!(message.contains("stale"), "{message}");
+    take(&mut sent);
+    sent.clear();
+    std::thread::sleep(Duration::from_millis(200));
+    assert_eq!(take(&mut sent), 0);
+    wait("frames again", || {
+        plc.image(PlcState::Run, &[1, 0, 1]);
+        (take(&mut sent) >= 2).then_some(())
+    });
+    assert!(
+        sent.contains(&(0x210, vec![1, 0], can_flag::NEWEST)) && sent.contains(&(0x211, vec![0x80], 0)),
+        "{sent:?}"
+    );
+    wait("the end of the safe state", || events(&mut events_port, "safe_left"));
+
+    // So does STOP, at once and although images keep coming.
+    plc.image(PlcState::Stop, &[2, 0, 0]);
+    let message = wait("the safe state", || events(&mut events_port, "safe_entered"));
+    assert!(message.contains("stopped"), "{message}");
+    take(&mut sent);
+    sent.clear();
+    for _ in 0..10 {
+        plc.image(PlcState::Stop, &[2, 0, 0]);
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    assert_eq!(take(&mut sent), 0);
+    drop(tx);
+
+    // Without a driver frames are refused and the service lives on.
+    plc.image(PlcState::Run, &[3, 0, 1]);
+    let mut late = ctx.subscriber::<CanFrame>("can0/tx").unwrap();
+    wait("frames after the driver came back", || {
+        plc.image(PlcState::Run, &[3, 0, 1]);
+        (late.drain(64, |_, _| ()) > 0).then_some(())
+    });
+    assert!(!matches!(rx.send(CanFrame::default()), Err(SendError::Full(_))));
+}

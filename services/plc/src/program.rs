@@ -1,0 +1,166 @@
+//! From files of the stack to an engine's program and setup.
+
+use crate::config::Config;
+use crate::engine::Program;
+use crate::setup::{External, InputRange, Setup};
+use dinrail_iec::{Addressing, Artifact, Source, compile};
+use ipc_types::stack::Stack;
+use ipc_types::wiring::{Area, ImageRange};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Largest source or module file.
+const MAX_FILE_BYTES: u64 = 64 * 1024 * 1024;
+
+/// Why there is no program.
+#[derive(Debug, thiserror::Error)]
+pub enum ProgramError {
+    #[error("cannot read {path}: {source}")]
+    Read { path: PathBuf, source: std::io::Error },
+    #[error("{path} has more than 64 MiB: this is no program")]
+    TooLong { path: PathBuf },
+    #[error("{path} is no text (UTF-8): {source}")]
+    Text { path: PathBuf, source: std::string::FromUtf8Error },
+    #[error("{path}: {source}")]
+    Artifact { path: PathBuf, source: dinrail_iec::ArtifactError },
+    #[error("a compiled module stands alone: name one .wasm file, or only sources")]
+    Mixed,
+    #[error("the program does not compile:\n{0}")]
+    Compile(String),
+}
+
+/// A program with the compiler's warnings as text.
+#[derive(Debug, Clone)]
+pub struct Compiled {
+    pub program: Arc<Program>,
+    pub warnings: Option<String>,
+}
+
+/// Reads and compiles; names in messages are the paths as given.
+pub fn load(dir: &Path, files: &[PathBuf], setup: &Setup) -> Result<Compiled, ProgramError> {
+    let is_module = |path: &PathBuf| path.extension().is_some_and(|e| e.eq_ignore_ascii_case("wasm"));
+    if files.iter().any(is_module) {
+        let [path] = files else { return Err(ProgramError::Mixed) };
+        let wasm = read(&dir.join(path))?;
+        let artifact = Artifact::from_wasm(&wasm)
+            .map_err(|source| ProgramError::Artifact { path: path.clone(), source })?;
+        return Ok(Compiled { program: Arc::new(Program { artifact, sources: Vec::new() }), warnings: None });
+    }
+    let mut sources = Vec::with_capacity(files.len());
+    for path in files {
+        let text = String::from_utf8(read(&dir.join(path))?)
+            .map_err(|source| ProgramError::Text { path: path.clone(), source })?;
+        sources.push(Source { name: path.display().to_string(), text });
+    }
+    compile_sources(sources, setup)
+}
+
+/// Compiles texts.
+pub fn compile_sources(sources: Vec<Source>, setup: &Setup) -> Result<Compiled, ProgramError> {
+    match compile(&sources, &setup.options()) {
+        Ok(compiled) => {
+            let warnings =
+                (!compiled.warnings.is_empty()).then(|| compiled.render_warnings(&sources, false));
+            Ok(Compiled { program: Arc::new(Program { artifact: compiled.artifact, sources }), warnings })
+        }
+        Err(diagnostics) => Err(ProgramError::Compile(diagnostics.render(false))),
+    }
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, ProgramError> {
+    let error = |source| ProgramError::Read { path: path.to_owned(), source };
+    if std::fs::metadata(path).map_err(error)?.len() > MAX_FILE_BYTES {
+        return Err(ProgramError::TooLong { path: path.to_owned() });
+    }
+    std::fs::read(path).map_err(error)
+}
+
+/// The setup of a service: its configuration and what its neighbours declare.
+pub fn setup(config: &Config, stack: &Stack, me: &str) -> Setup {
+    let mut setup = Setup {
+        addressing: config.addressing,
+        input_bytes: Config::area_bytes(config.input_bytes),
+        output_bytes: Config::area_bytes(config.output_bytes),
+        marker_bytes: Config::area_bytes(config.marker_bytes),
+        routes: config.route.clone(),
+        cycle_ns: config.cycle.map(|c| c.ns()),
+        debug: config.debug,
+        real_to_int: config.real_to_int,
+        mod_by_zero: config.mod_by_zero,
+        files: config.program.iter().map(|p| p.display().to_string()).collect(),
+        ..Setup::default()
+    };
+    for service in stack.services.iter().filter(|s| s.wiring.plc.as_deref() == Some(me)) {
+        for range in &service.wiring.inputs {
+            setup.inputs.push(InputRange {
+                owner: service.name.clone(),
+                label: range.label.clone(),
+                byte: range.byte,
+                bytes: range.bytes,
+                bit: range.bit,
+                on_bad: range.on_bad,
+                status_byte: range.status_byte,
+            });
+        }
+        for range in service.wiring.inputs.iter().chain(&service.wiring.outputs) {
+            if let Ok(Some(external)) = external(range, &service.name, config.addressing.into()) {
+                setup.externals.push(external);
+            }
+        }
+    }
+    setup
+}
+
+/// The VAR_GLOBAL of a range with a `symbol`. The error is the reason why there can be none.
+pub fn external(range: &ImageRange, owner: &str, addressing: Addressing) -> Result<Option<External>, String> {
+    let Some(name) = &range.symbol else { return Ok(None) };
+    let type_name = match (&range.type_name, range.bit, range.bytes) {
+        (Some(name), _, _) => name.clone(),
+        (None, Some(_), _) => "BOOL".to_owned(),
+        (None, None, 1) => "USINT".to_owned(),
+        (None, None, 2) => "UINT".to_owned(),
+        (None, None, 4) => "UDINT".to_owned(),
+        (None, None, 8) => "ULINT".to_owned(),
+        (None, None, n) => return Err(format!("{n} bytes are no elementary type, a symbol needs 1, 2, 4 or 8")),
+    };
+    let address = address_text(range, addressing)?;
+    let origin = format!("service '{owner}' {}", range.key);
+    Ok(Some(External { name: name.clone(), address, type_name, origin }))
+}
+
+/// The `%`-address of a range in the service's way to count.
+pub fn address_text(range: &ImageRange, addressing: Addressing) -> Result<String, String> {
+    let area = range.area.letter();
+    if let Some(bit) = range.bit {
+        return Ok(format!("%{area}X{}.{bit}", range.byte));
+    }
+    let (letter, size, base) = match range.bytes {
+        1 => ('B', 1, 3072),
+        2 => ('W', 2, 1024),
+        4 => ('D', 4, 4096),
+        8 => ('L', 8, 8192),
+        n => return Err(format!("{n} bytes have no %-address")),
+    };
+    let number = match addressing {
+        Addressing::Byte => return Ok(format!("%{area}{letter}{}", range.byte)),
+        Addressing::Element => Some(range.byte),
+        Addressing::OpenPlc => range.byte.checked_sub(base),
+    };
+    match number {
+        Some(byte) if byte % size == 0 => Ok(format!("%{area}{letter}{}", byte / size)),
+        _ => Err(format!(
+            "byte {} of %{area} cannot be named as %{area}{letter}: place it at a multiple of {size}, or set addressing = \"byte\" in the plc",
+            range.byte
+        )),
+    }
+}
+
+/// All ranges of %Q and %M that neighbours use, for messages.
+pub fn outputs_of<'a>(stack: &'a Stack, me: &'a str) -> impl Iterator<Item = (&'a str, &'a ImageRange)> {
+    stack
+        .services
+        .iter()
+        .filter(move |s| s.wiring.plc.as_deref() == Some(me))
+        .flat_map(|s| s.wiring.outputs.iter().map(|r| (s.name.as_str(), r)))
+        .filter(|(_, r)| r.area != Area::Input)
+}

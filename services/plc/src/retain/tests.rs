@@ -1,0 +1,71 @@
+use super::*;
+use proptest::prelude::*;
+use std::time::{Duration, Instant};
+
+#[test]
+fn the_newest_commit_is_found_again() {
+    let mut memory = vec![0u8; MEMORY_BYTES];
+    assert_eq!(newest(&memory), None);
+    let mut committer = Committer::new(&memory);
+    for i in 0..5u8 {
+        committer.commit(&mut memory, 7, i64::from(i), &[i; 10]);
+        let kept = newest(&memory).unwrap();
+        assert_eq!((kept.seq, kept.plc_time_ns, kept.bytes), (u64::from(i) + 1, i64::from(i), vec![i; 10]));
+        committer = Committer::new(&memory);
+    }
+}
+
+proptest! {
+    /// Death in the middle of a commit: any prefix of its bytes in any of its two steps was stored.
+    #[test]
+    fn a_torn_commit_leaves_the_one_before(len in 1usize..300, stored in 0usize..364, commits in 1u8..4) {
+        let mut memory = vec![0u8; MEMORY_BYTES];
+        let mut committer = Committer::new(&memory);
+        for i in 0..commits {
+            committer.commit(&mut memory, 1, 1, &vec![i; len]);
+        }
+        let before = memory.clone();
+        committer.commit(&mut memory, 1, 2, &vec![99; len]);
+        // Data first, then the header.
+        let slot = usize::from(memory[..SLOT_BYTES] == before[..SLOT_BYTES]) * SLOT_BYTES;
+        let mut torn = before;
+        let data = stored.min(len);
+        torn[slot + HEADER_BYTES..][..data].copy_from_slice(&memory[slot + HEADER_BYTES..][..data]);
+        let head = stored.saturating_sub(len).min(HEADER_BYTES);
+        torn[slot..slot + head].copy_from_slice(&memory[slot..slot + head]);
+        let kept = newest(&torn).unwrap();
+        prop_assert!(kept.bytes == vec![commits - 1; len] || kept.bytes == vec![99; len]);
+    }
+
+    #[test]
+    fn any_memory_is_read_without_panic(mut head in prop::collection::vec(any::<u8>(), 64), len in any::<u64>()) {
+        head[..8].copy_from_slice(&MAGIC);
+        head[32..40].copy_from_slice(&len.to_le_bytes());
+        prop_assert_eq!(decode_slot(&head), None);
+    }
+}
+
+#[test]
+fn the_disk_gets_the_newest_state_and_gives_it_back() {
+    let dir = std::env::temp_dir().join(format!("dinrail-retain-{}", std::process::id()));
+    std::fs::create_dir_all(&dir).unwrap();
+    let path = dir.join("a.retain");
+    let fd = rustix::fs::memfd_create("retain-test", rustix::fs::MemfdFlags::CLOEXEC).unwrap();
+    rustix::fs::ftruncate(&fd, MEMORY_BYTES as u64).unwrap();
+    let mut map = Mapping::new(&fd, MEMORY_BYTES).unwrap();
+    assert!(Mapping::new(&fd, MEMORY_BYTES + 1).is_err());
+    let mut committer = Committer::new(map.bytes());
+    let copy = DiskCopy::start(fd.try_clone().unwrap(), path.clone()).unwrap();
+    committer.commit(map.bytes_mut(), 5, 1, b"one");
+    let limit = Instant::now() + Duration::from_secs(20);
+    while read_file(&path).is_none_or(|kept| kept.bytes != b"one") {
+        assert!(Instant::now() < limit, "the change never reached the disk");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    committer.commit(map.bytes_mut(), 5, 2, b"two");
+    drop(copy);
+    assert_eq!(read_file(&path).unwrap().bytes, b"two");
+    std::fs::write(&path, b"rubbish").unwrap();
+    assert_eq!(read_file(&path), None);
+    std::fs::remove_dir_all(&dir).unwrap();
+}

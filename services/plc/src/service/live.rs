@@ -1,0 +1,705 @@
+//! The loop: waits for clock, inputs and commands, runs scans, publishes what came out.
+
+use super::acks::Acks;
+use super::inputs::InputSource;
+use super::jobs::{self, Asker, Order, Request};
+use super::load::Loading;
+use super::status::{Counters, ScanTimes, status};
+use super::{RETAIN_FD, RunError, restart_of};
+use crate::config::{Config, DEFAULT_CYCLE, Trigger};
+use crate::engine::{Engine, FaultReport, Runtime, Stamps, write_result};
+use crate::retain::{Committer, DiskCopy, MEMORY_BYTES, Mapping, newest, read_file};
+use ipc_types::event::{EventBody, EventKind, Level};
+use ipc_types::inbox::Inbox;
+use ipc_types::payload::{
+    Event, HealthState, Image, ImageWrite, Job, JobResult, PlcState, Quality, ScanPart,
+};
+use ipc_types::port::{Publisher, Subscriber};
+use ipc_types::rail::RailError;
+use ipc_types::reactor::Reactor;
+use ipc_types::scan_record::{Content, Reason, Source, Start, flag, part_header, parts};
+use ipc_types::topic::{EVENTS, TopicKind};
+use ipc_types::{Context, clock};
+use serde_json::{Value, json};
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// Most writes taken in one scan; the rest waits.
+const WRITES_PER_SCAN: usize = 256;
+/// Older writes are dropped.
+const WRITE_AGE_NS: u64 = 1_000_000_000;
+/// Heartbeat, status and repeats hang on this clock.
+const TICK: Duration = Duration::from_millis(50);
+/// The image is sent again after this time, because a late reader only gets it then.
+const REPEAT_NS: u64 = 90_000_000;
+const STATUS_NS: u64 = 1_000_000_000;
+const KEYFRAME_NS: u64 = 10_000_000_000;
+/// An automatic start follows a fault after this time at the earliest.
+const RESTART_NS: u64 = 1_000_000_000;
+/// Parts of a keyframe that are sent in one turn: what a reader's queue takes at ease.
+const PARTS_PER_TURN: usize = 64;
+/// UTC that drifted less is not worth a new offset.
+const UTC_STEP_NS: i64 = 50_000;
+
+/// A running service.
+pub(super) struct Live {
+    pub engine: Engine,
+    pub inputs: Vec<InputSource>,
+    pub counters: Counters,
+    pub shown_times: ScanTimes,
+    times: ScanTimes,
+    config: Config,
+    runtime: Runtime,
+    dir: PathBuf,
+    root: PathBuf,
+    // Ports.
+    inbox: Inbox,
+    image_port: Publisher<Image>,
+    scan_port: Publisher<ScanPart>,
+    keyframe_port: Publisher<ScanPart>,
+    results: Publisher<JobResult>,
+    writes: Subscriber<ImageWrite>,
+    jobs: Subscriber<Job>,
+    events: Subscriber<Event>,
+    // State.
+    header: Image,
+    acks: Acks,
+    orders: Vec<(Source, Order)>,
+    replies: Vec<Asker>,
+    loading: Option<Loading>,
+    /// Next part of the keyframe that is being sent.
+    keyframe_next: Option<usize>,
+    keyframe_wanted: Option<Reason>,
+    keyframe_due_ns: u64,
+    retain: Option<(Mapping, Committer)>,
+    disk: Option<DiskCopy>,
+    retain_layout: u64,
+    started_ns: u64,
+    waiting: bool,
+    /// PLC time 0 as CLOCK_MONOTONIC.
+    base_ns: i64,
+    last_stamp_ns: i64,
+    last_scan_ns: u64,
+    utc_offset_ns: i64,
+    image_sent_ns: u64,
+    status_ns: u64,
+    beat_ns: u64,
+    restart_at_ns: Option<u64>,
+    hurry: bool,
+}
+
+impl Live {
+    /// Opens every port and finds out how to start.
+    pub(super) fn open(
+        ctx: &mut Context,
+        config: Config,
+        runtime: Runtime,
+        engine: Engine,
+    ) -> Result<Self, RunError> {
+        let service = ctx.service.clone();
+        let rail = |source: RailError| RunError::Rail { service: service.clone(), source };
+        let of = |kind: TopicKind| kind.of(&service);
+        let now_ns = clock::mono_ns();
+        let mut live = Self {
+            inputs: InputSource::open_all(ctx).map_err(rail)?,
+            inbox: ctx.inbox().map_err(rail)?,
+            image_port: ctx.publisher(&of(TopicKind::Image)).map_err(rail)?,
+            scan_port: ctx.publisher(&of(TopicKind::Scan)).map_err(rail)?,
+            keyframe_port: ctx.publisher(&of(TopicKind::Keyframe)).map_err(rail)?,
+            results: ctx.publisher(&of(TopicKind::Results)).map_err(rail)?,
+            writes: ctx.subscriber(&of(TopicKind::Writes)).map_err(rail)?,
+            jobs: ctx.subscriber(&of(TopicKind::Jobs)).map_err(rail)?,
+            events: ctx.subscriber(EVENTS).map_err(rail)?,
+            counters: Counters::default(),
+            shown_times: ScanTimes::default(),
+            times: ScanTimes::default(),
+            dir: ctx.stack.dir.clone(),
+            root: ctx.stack.root.clone(),
+            header: header_of(&engine),
+            acks: Acks::default(),
+            orders: Vec::with_capacity(64),
+            replies: Vec::with_capacity(64),
+            loading: None,
+            keyframe_next: None,
+            keyframe_wanted: Some(Reason::EngineStart),
+            keyframe_due_ns: now_ns + KEYFRAME_NS,
+            retain: None,
+            disk: None,
+            retain_layout: engine.retain_layout(),
+            started_ns: now_ns,
+            waiting: true,
+            base_ns: now_ns as i64,
+            last_stamp_ns: now_ns as i64,
+            last_scan_ns: 0,
+            utc_offset_ns: clock::utc_offset_ns(),
+            image_sent_ns: 0,
+            status_ns: 0,
+            beat_ns: 0,
+            restart_at_ns: None,
+            hurry: false,
+            config,
+            runtime,
+            engine,
+        };
+        let start = live.open_retain(ctx);
+        let me = Source { writer: ctx.writer, generation: ctx.generation, seq: 0 };
+        live.orders.push((me, Order::Start(start)));
+        live.tell_loaded(ctx);
+        Ok(live)
+    }
+
+    /// Takes over the RETAIN memory; what is kept decides between warm and cold.
+    fn open_retain(&mut self, ctx: &mut Context) -> Start {
+        let fd = match ctx.take_fd(RETAIN_FD) {
+            Ok(fd) => fd,
+            Err(e) => {
+                tracing::warn!("{e}: RETAIN variables are not kept");
+                return Start::Cold;
+            }
+        };
+        let mapping = match Mapping::new(&fd, MEMORY_BYTES) {
+            Ok(mapping) => mapping,
+            Err(e) => {
+                tracing::warn!("the RETAIN memory cannot be mapped: {e}; RETAIN variables are not kept");
+                return Start::Cold;
+            }
+        };
+        let mut kept = newest(mapping.bytes());
+        let committer = Committer::new(mapping.bytes());
+        self.retain = Some((mapping, committer));
+        if !self.engine.retain().is_empty() {
+            let path = self.config.retain_file.as_ref().map_or_else(
+                || ctx.stack.dir.join(format!("{}.{}.retain", ctx.stack.name, ctx.service)),
+                |file| ctx.stack.dir.join(file),
+            );
+            if kept.is_none() {
+                kept = read_file(&path);
+            }
+            match DiskCopy::start(fd, path) {
+                Ok(copy) => self.disk = Some(copy),
+                Err(e) => tracing::error!("RETAIN variables are not copied to disk: {e}"),
+            }
+        }
+        let Some(kept) = kept else { return Start::Cold };
+        if kept.layout != self.retain_layout || !self.engine.set_retain(&kept.bytes) {
+            tracing::warn!("the kept RETAIN variables are of another program: cold start");
+            return Start::Cold;
+        }
+        self.base_ns = self.started_ns as i64 - kept.plc_time_ns;
+        Start::Warm
+    }
+
+    pub(super) fn retain_failures(&self) -> u64 {
+        self.disk.as_ref().map_or(0, DiskCopy::failures)
+    }
+
+    /// Leaves the module where the recorder finds it, and says that it is loaded.
+    fn tell_loaded(&mut self, ctx: &mut Context) {
+        let hash = self.engine.program_hash();
+        let mut detail = json!({ "program_hash": format!("{hash:016x}"), "files": self.engine.setup().files });
+        let Some(program) = self.engine.program().cloned() else {
+            ctx.event(EventKind::Loaded, Level::Info, "no program: image and routes only", detail);
+            return;
+        };
+        let path = self.root.join(format!("{}.{hash:016x}.wasm", ctx.service));
+        match std::fs::write(&path, &program.artifact.wasm) {
+            Ok(()) => detail["artifact"] = json!(path),
+            Err(e) => tracing::warn!("the program cannot be left for the recorder in {}: {e}", path.display()),
+        }
+        let tasks: Vec<&str> = program.artifact.map.tasks.iter().map(|t| t.name.as_str()).collect();
+        detail["tasks"] = json!(tasks);
+        let names = self.engine.setup().files.join(", ");
+        ctx.event(EventKind::Loaded, Level::Info, format!("program {names} loaded"), detail);
+    }
+
+    // --- the loop -------------------------------------------------------------------------------------
+
+    /// Until the stack stops the service.
+    pub(super) fn run(&mut self, ctx: &mut Context) -> Result<(), RunError> {
+        let service = ctx.service.clone();
+        let system =
+            |what: &'static str| { let service = service.clone(); move |source| RunError::System { service, what, source } };
+        let mut reactor = Reactor::new().map_err(system("epoll"))?;
+        let inbox = reactor.add(self.inbox.fd()).map_err(system("watching the inbox"))?;
+        let stop = reactor.add(ctx.shutdown_fd()).map_err(system("watching for the end"))?;
+        let tick = reactor.add_timer(TICK).map_err(system("the clock"))?;
+        let alarm = reactor.add_alarm().map_err(system("the scan clock"))?;
+        ctx.ready();
+        let mut due_ns = clock::mono_ns();
+        reactor.set_alarm(alarm, due_ns).map_err(system("the scan clock"))?;
+        self.tick(ctx);
+        loop {
+            let woken = reactor.wait(None).map_err(system("waiting"))?;
+            let (mut rang, mut ticked) = (false, false);
+            for wake in woken {
+                if *wake == stop {
+                    self.stop(ctx);
+                    return Ok(());
+                }
+                rang |= *wake == inbox;
+                ticked |= *wake == tick;
+            }
+            if rang && self.ring(ctx) {
+                due_ns = due_ns.min(self.earliest_ns());
+            }
+            if ticked {
+                self.tick(ctx);
+            }
+            if self.waiting && self.all_there() {
+                due_ns = clock::mono_ns();
+            }
+            let now_ns = clock::mono_ns();
+            if !self.waiting && (now_ns >= due_ns || self.hurry) {
+                self.hurry = false;
+                self.scan(ctx, now_ns, due_ns);
+                due_ns = self.next_due_ns(now_ns);
+            }
+            self.send_keyframe();
+            let wake_ns =
+                if self.waiting { self.started_ns + self.config.start_timeout.ns() + 1 } else { due_ns };
+            reactor.set_alarm(alarm, wake_ns).map_err(system("the scan clock"))?;
+        }
+    }
+
+    /// The first scan waits for its inputs, but not for ever.
+    fn all_there(&mut self) -> bool {
+        let mut all = true;
+        for source in &mut self.inputs {
+            source.poll();
+            all &= source.delivered();
+        }
+        let over = clock::mono_ns().saturating_sub(self.started_ns) > self.config.start_timeout.ns();
+        if all || over {
+            self.waiting = false;
+            // The PLC's time does not run while it waits.
+            let waited = clock::mono_ns() as i64 - self.started_ns as i64;
+            self.base_ns += waited;
+        }
+        !self.waiting
+    }
+
+    /// The inbox rang. Says whether a scan is wanted because of it.
+    fn ring(&mut self, ctx: &mut Context) -> bool {
+        self.inbox.drain();
+        let mut news = false;
+        for source in &mut self.inputs {
+            news |= source.poll();
+        }
+        self.read_events();
+        self.take_jobs(ctx);
+        news && self.config.trigger == Trigger::Inputs
+    }
+
+    fn read_events(&mut self) {
+        let Self { events, inputs, .. } = self;
+        events.drain(256, |header, tail| {
+            // Only the launcher knows who died.
+            if header.stamp.writer != 0 {
+                return;
+            }
+            let Ok(body) = serde_json::from_slice::<EventBody>(tail) else { return };
+            if matches!(body.event, EventKind::Died | EventKind::Hung | EventKind::Restarting | EventKind::Held)
+                && let Some(source) = inputs.iter_mut().find(|s| s.name == body.service)
+            {
+                source.died(body.t_ns);
+            }
+        });
+    }
+
+    /// When the next scan may come at the earliest.
+    fn earliest_ns(&self) -> u64 {
+        self.last_scan_ns + self.config.min_interval.ns()
+    }
+
+    fn cycle_ns(&self) -> u64 {
+        let shortest = self.engine.shortest_period_ns().and_then(|ns| u64::try_from(ns).ok());
+        self.config.cycle.map_or_else(|| shortest.unwrap_or(DEFAULT_CYCLE.ns()), |c| c.ns())
+    }
+
+    /// When the next scan is due.
+    fn next_due_ns(&self, now_ns: u64) -> u64 {
+        let latest = now_ns + self.config.max_interval.ns();
+        let running = self.engine.state() == PlcState::Run;
+        let task = self.engine.next_task_ns().filter(|_| running).map(|plc| (plc + self.base_ns).max(0) as u64);
+        match (self.config.trigger, task) {
+            (_, Some(task)) => task.clamp(now_ns.min(latest), latest),
+            (Trigger::Inputs, None) => latest,
+            (Trigger::Cycle, None) => {
+                // On the grid of the last stamp, so that the clock has no drift.
+                let cycle = self.cycle_ns();
+                let mut next = self.last_stamp_ns.max(0) as u64 + cycle;
+                if next <= now_ns {
+                    next = now_ns - (now_ns - next) % cycle + cycle;
+                }
+                next.min(latest.max(now_ns + cycle.min(REPEAT_NS)))
+            }
+        }
+    }
+
+    // --- a scan ---------------------------------------------------------------------------------------
+
+    fn scan(&mut self, ctx: &mut Context, now_ns: u64, due_ns: u64) {
+        if self.restart_at_ns.is_some_and(|at| now_ns >= at) {
+            self.restart_at_ns = None;
+            if let Some(kind) = restart_of(self.config.on_fault) {
+                let me = Source { writer: ctx.writer, generation: ctx.generation, seq: 0 };
+                self.orders.push((me, Order::Start(kind)));
+            }
+        }
+        let before = self.engine.state();
+        let stamps = self.stamps(now_ns, due_ns);
+        self.engine.begin(stamps);
+        let mut commands = 0u32;
+        for (source, order) in &self.orders {
+            self.engine.control(source, &order.command());
+            commands += 1;
+        }
+        let timeout_ns = self.config.input_timeout.ns();
+        for source in &mut self.inputs {
+            source.poll();
+            source.apply(&mut self.engine, now_ns, timeout_ns, true);
+        }
+        self.take_writes(now_ns);
+        let outcome = self.engine.finish();
+        if let Some((mapping, committer)) = &mut self.retain {
+            let plc_time_ns = self.last_stamp_ns - self.base_ns;
+            committer.commit(mapping.bytes_mut(), self.retain_layout, plc_time_ns, self.engine.retain());
+        }
+        self.publish_record();
+        self.publish_image(now_ns);
+        self.last_scan_ns = now_ns;
+        let end_ns = clock::mono_ns();
+        let took_ns = end_ns - now_ns;
+        self.times.scans += 1;
+        self.times.sum_ns += took_ns;
+        self.times.max_ns = self.times.max_ns.max(took_ns);
+        self.times.late_max_ns = self.times.late_max_ns.max(now_ns.saturating_sub(due_ns));
+        if commands > 0 {
+            self.tell_orders(ctx, before);
+        }
+        if let Some(fault) = outcome.fault {
+            self.tell_fault(ctx, &fault, end_ns);
+        }
+        self.tell_quality(ctx);
+        if end_ns >= self.keyframe_due_ns {
+            self.keyframe_wanted.get_or_insert(Reason::Periodic);
+        }
+        if end_ns - self.beat_ns > TICK.as_nanos() as u64 {
+            self.beat_ns = end_ns;
+            ctx.beat();
+        }
+    }
+
+    /// A scan on time carries the time it was due: the clock's jitter is not the program's.
+    fn stamps(&mut self, now_ns: u64, due_ns: u64) -> Stamps {
+        let late_ns = now_ns.saturating_sub(due_ns);
+        let on_time = self.config.trigger == Trigger::Cycle && now_ns >= due_ns && late_ns < self.cycle_ns();
+        let stamp = if on_time { due_ns } else { now_ns } as i64;
+        let stamp = stamp.max(self.last_stamp_ns);
+        self.last_stamp_ns = stamp;
+        if self.orders.iter().any(|(_, order)| *order == Order::Start(Start::Cold)) {
+            self.base_ns = stamp;
+        }
+        Stamps { t_ns: now_ns, plc_time_ns: stamp - self.base_ns, utc_ns: now_ns as i64 + self.utc_offset_ns }
+    }
+
+    fn take_writes(&mut self, now_ns: u64) {
+        let Self { writes, engine, header, acks, counters, .. } = self;
+        writes.drain(WRITES_PER_SCAN, |write, tail| {
+            let stamp = write.stamp;
+            let old = now_ns.saturating_sub(stamp.t_ns) > WRITE_AGE_NS;
+            let judged = if old { write_result::TOO_OLD } else { write_result::APPLIED };
+            let source = Source { writer: stamp.writer, generation: stamp.generation, seq: stamp.seq };
+            let result = engine.write(&source, judged, tail);
+            counters.writes += 1;
+            counters.writes_refused += u64::from(result != write_result::APPLIED);
+            acks.note(header, stamp.writer, stamp.generation, stamp.seq, result);
+        });
+    }
+
+    fn publish_record(&mut self) {
+        let content = self.engine.record();
+        let scan = self.engine.scan();
+        if Content::parse(&content[..content.len().min(ipc_types::scan_record::HEAD_BYTES)])
+            .is_ok_and(|c| c.head.flags & flag::INCOMPLETE != 0)
+        {
+            self.counters.records_incomplete += 1;
+        }
+        for (i, part) in parts(content).enumerate() {
+            if self.scan_port.send_tail(part_header(scan, i, content.len()), part).is_err() {
+                self.counters.records_lost += 1;
+            }
+        }
+        self.scan_port.ring();
+    }
+
+    fn publish_image(&mut self, now_ns: u64) {
+        let engine = &self.engine;
+        self.header.scan = engine.scan();
+        self.header.plc_time_ns = self.last_stamp_ns - self.base_ns;
+        self.header.utc_ns = now_ns as i64 + self.utc_offset_ns;
+        self.header.program_hash = engine.program_hash();
+        self.header.state = engine.state() as u32;
+        self.header.trap = engine.fault().map_or(0, |f| f.trap);
+        let _ = self.image_port.send_tail(self.header, engine.image_bytes());
+        self.image_port.ring();
+        self.image_sent_ns = now_ns;
+    }
+
+    // --- what is not every scan's ---------------------------------------------------------------------
+
+    fn tell_orders(&mut self, ctx: &mut Context, before: PlcState) {
+        let orders = std::mem::take(&mut self.orders);
+        for (source, order) in &orders {
+            let by = ctx.stack.writer_name(source.writer);
+            match order {
+                Order::Start(kind) => {
+                    let message = format!("PLC started, {} start", kind.word());
+                    let detail = json!({ "start": kind, "by": by, "scan": self.engine.scan() });
+                    ctx.event(EventKind::PlcStarted, Level::Info, message, detail);
+                    ctx.set_state(HealthState::Ready);
+                    self.restart_at_ns = None;
+                }
+                Order::Stop if before == PlcState::Run => {
+                    let detail = json!({ "by": by, "scan": self.engine.scan() });
+                    ctx.event(EventKind::PlcStopped, Level::Warning, format!("PLC stopped by {by}"), detail);
+                }
+                Order::Force(patch, path) => {
+                    let text = self.engine.resolve(path).map_or_else(|_| "?".to_owned(), |c| c.text(self.engine.memory()));
+                    let detail = json!({ "var": path, "value": text, "by": by, "offset": patch.offset });
+                    ctx.event(EventKind::Forced, Level::Warning, format!("{path} forced to {text} by {by}"), detail);
+                }
+                Order::Unforce(_, path) => {
+                    let detail = json!({ "var": path, "by": by });
+                    ctx.event(EventKind::Forced, Level::Info, format!("{path} no longer forced, by {by}"), detail);
+                }
+                Order::UnforceAll => {
+                    ctx.event(EventKind::Forced, Level::Info, format!("nothing forced any more, by {by}"), json!({ "by": by }));
+                }
+                Order::Stop | Order::Set(..) | Order::Load(_) => {}
+            }
+        }
+        self.orders = orders;
+        self.orders.clear();
+        let now_ns = clock::mono_ns();
+        for i in 0..self.replies.len() {
+            let asker = self.replies[i];
+            let code = if now_ns > asker.deadline_ns { 2 } else { 0 };
+            self.reply(&asker, code, json!({ "ok": true }));
+        }
+        self.replies.clear();
+    }
+
+    fn tell_fault(&mut self, ctx: &mut Context, fault: &FaultReport, now_ns: u64) {
+        self.counters.faults += 1;
+        let mut detail = serde_json::to_value(fault).unwrap_or(Value::Null);
+        detail["scan"] = json!(self.engine.scan());
+        ctx.event(EventKind::ProgramFault, Level::Fault, format!("program fault: {}", fault.message), detail);
+        ctx.set_state(HealthState::Degraded);
+        self.keyframe_wanted = Some(Reason::Trap);
+        if restart_of(self.config.on_fault).is_some() {
+            self.restart_at_ns = Some(now_ns + RESTART_NS);
+        }
+    }
+
+    fn tell_quality(&mut self, ctx: &mut Context) {
+        for i in 0..self.inputs.len() {
+            let quality = self.inputs[i].quality(&self.engine);
+            let told = self.inputs[i].told.replace(quality);
+            if told == Some(quality) || (told.is_none() && quality == Quality::Good) {
+                continue;
+            }
+            let name = self.inputs[i].name.clone();
+            let (level, words) = match quality {
+                Quality::Good => (Level::Info, "good"),
+                Quality::Stale => (Level::Warning, "stale"),
+                Quality::NoData => (Level::Warning, "without data"),
+                Quality::OwnerDead => (Level::Warning, "bad: their service is dead or silent"),
+            };
+            let detail = json!({ "quality": quality, "was": told, "scan": self.engine.scan() });
+            ctx.event_about(&name, EventKind::InputQuality, level, format!("inputs of '{name}' are {words}"), detail);
+        }
+    }
+
+    fn take_jobs(&mut self, ctx: &mut Context) {
+        let mut taken: Vec<(Asker, Vec<u8>)> = Vec::new();
+        self.jobs.drain(16, |job, tail| {
+            let stamp = job.stamp;
+            let source = Source { writer: stamp.writer, generation: stamp.generation, seq: stamp.seq };
+            taken.push((Asker { source, deadline_ns: job.deadline_t_ns }, tail.to_vec()));
+        });
+        for (asker, tail) in taken {
+            self.counters.jobs += 1;
+            if clock::mono_ns() > asker.deadline_ns {
+                self.reply(&asker, 2, json!({ "error": "expired before it was read" }));
+                continue;
+            }
+            match jobs::parse(&tail, &self.engine) {
+                Ok(request) => self.take_request(ctx, asker, request),
+                Err((code, text)) => self.reply(&asker, code, json!({ "error": text })),
+            }
+        }
+    }
+
+    fn take_request(&mut self, ctx: &mut Context, asker: Asker, request: Request) {
+        match request {
+            Request::Order(order) => {
+                if self.orders.len() >= 64 {
+                    self.reply(&asker, 1, json!({ "error": "64 commands already wait for the next scan" }));
+                    return;
+                }
+                self.orders.push((asker.source, order));
+                self.replies.push(asker);
+                self.hurry = true;
+            }
+            Request::Answer(value) => self.reply(&asker, 0, json!({ "ok": value })),
+            Request::Status => {
+                let value = status(self, clock::mono_ns());
+                self.reply(&asker, 0, json!({ "ok": value }));
+            }
+            Request::Keyframe => {
+                self.keyframe_wanted.get_or_insert(Reason::Request);
+                self.reply(&asker, 0, json!({ "ok": true }));
+            }
+            Request::Load { path, cold } => {
+                if self.loading.is_some() {
+                    self.reply(&asker, 1, json!({ "error": "another program is being loaded" }));
+                    return;
+                }
+                tracing::info!("loading {} for {}", path.display(), ctx.stack.writer_name(asker.source.writer));
+                let started = Loading::start(asker, &self.runtime, self.engine.setup(), self.dir.clone(), path, cold);
+                match started {
+                    Ok(loading) => self.loading = Some(loading),
+                    Err(text) => self.reply(&asker, 1, json!({ "error": text })),
+                }
+            }
+        }
+    }
+
+    fn finish_load(&mut self, ctx: &mut Context) {
+        let Some(result) = self.loading.as_ref().and_then(Loading::poll) else { return };
+        let Some(loading) = self.loading.take() else { return };
+        let mut engine = match result {
+            Ok(engine) => engine,
+            Err(text) => {
+                self.reply(&loading.asker, 1, json!({ "error": format!("{}: {text}", loading.path.display()) }));
+                return;
+            }
+        };
+        engine.continue_from(&self.engine);
+        let layout = engine.retain_layout();
+        let kept = !loading.cold && layout == self.retain_layout && engine.set_retain(self.engine.retain());
+        let start = if kept { Start::Warm } else { Start::Cold };
+        if self.engine.forces().next().is_some() {
+            ctx.event(EventKind::Forced, Level::Info, "nothing forced any more: a new program", Value::Null);
+        }
+        let had_retain_file = self.disk.is_some();
+        self.engine = engine;
+        self.retain_layout = layout;
+        if !self.engine.retain().is_empty() && !had_retain_file {
+            tracing::warn!("the new program's RETAIN variables are copied to disk only after a restart of the service");
+        }
+        self.orders.clear();
+        self.orders.push((loading.asker.source, Order::Load(self.engine.program_hash())));
+        self.orders.push((loading.asker.source, Order::Start(start)));
+        self.replies.push(loading.asker);
+        self.keyframe_next = None;
+        self.engine.take_keyframe(Reason::Load);
+        self.keyframe_next = Some(0);
+        self.send_keyframe();
+        self.tell_loaded(ctx);
+        self.hurry = true;
+    }
+
+    fn reply(&mut self, asker: &Asker, code: u32, body: Value) {
+        let header = JobResult {
+            job_seq: asker.source.seq,
+            job_writer: asker.source.writer,
+            job_generation: asker.source.generation,
+            code,
+            ..JobResult::default()
+        };
+        let text = serde_json::to_vec(&body).unwrap_or_default();
+        let sent = if text.len() > self.results.max_tail() as usize {
+            let short = json!({ "error": "the answer is longer than 4096 bytes; ask for less at once" });
+            let header = JobResult { code: 1, ..header };
+            self.results.send_tail(header, &serde_json::to_vec(&short).unwrap_or_default())
+        } else {
+            self.results.send_tail(header, &text)
+        };
+        if let Err(e) = sent {
+            tracing::warn!("an answer was not sent: {e}");
+        }
+        self.results.ring();
+    }
+
+    /// Sends the next parts of a keyframe, or takes one that is wanted.
+    fn send_keyframe(&mut self) {
+        if self.keyframe_next.is_none() {
+            let Some(reason) = self.keyframe_wanted.take() else { return };
+            self.engine.take_keyframe(reason);
+            self.keyframe_next = Some(0);
+            self.keyframe_due_ns = clock::mono_ns() + KEYFRAME_NS;
+        }
+        let Some(next) = self.keyframe_next else { return };
+        let content = self.engine.keyframe();
+        let scan = Content::parse(&content[..content.len().min(ipc_types::scan_record::HEAD_BYTES)])
+            .map_or(0, |c| c.head.scan);
+        let all = parts(content);
+        let count = all.len();
+        for (i, part) in all.enumerate().skip(next).take(PARTS_PER_TURN) {
+            if self.keyframe_port.send_tail(part_header(scan, i, content.len()), part).is_err() {
+                self.counters.records_lost += 1;
+            }
+        }
+        self.keyframe_port.ring();
+        self.keyframe_next = (next + PARTS_PER_TURN < count).then_some(next + PARTS_PER_TURN);
+        if self.keyframe_next.is_none() {
+            self.counters.keyframes += 1;
+        }
+    }
+
+    fn tick(&mut self, ctx: &mut Context) {
+        let now_ns = clock::mono_ns();
+        self.beat_ns = now_ns;
+        ctx.beat();
+        self.read_events();
+        self.take_jobs(ctx);
+        self.finish_load(ctx);
+        if now_ns - self.image_sent_ns > REPEAT_NS {
+            self.publish_image(now_ns);
+        }
+        if now_ns - self.status_ns > STATUS_NS {
+            self.status_ns = now_ns;
+            let offset_ns = clock::utc_offset_ns();
+            if (offset_ns - self.utc_offset_ns).abs() > UTC_STEP_NS {
+                self.utc_offset_ns = offset_ns;
+            }
+            self.shown_times = std::mem::take(&mut self.times);
+            ctx.status(&status(self, now_ns));
+        }
+    }
+
+    /// The end: owners of outputs are told at once, RETAIN reaches the disk.
+    fn stop(&mut self, ctx: &mut Context) {
+        ctx.set_state(HealthState::Stopping);
+        let now_ns = clock::mono_ns();
+        self.header.state = PlcState::Stop as u32;
+        let _ = self.image_port.send_tail(self.header, self.engine.image_bytes());
+        self.image_port.ring();
+        let detail = json!({ "scan": self.engine.scan() });
+        ctx.event(EventKind::PlcStopped, Level::Info, "PLC stopped with the stack", detail);
+        drop(self.disk.take());
+        tracing::debug!("stopped after {} ms", (clock::mono_ns() - now_ns) / 1_000_000);
+    }
+}
+
+fn header_of(engine: &Engine) -> Image {
+    let image = engine.image();
+    Image {
+        input_bytes: image.input.bytes,
+        output_bytes: image.output.bytes,
+        marker_bytes: image.marker.bytes,
+        ..Image::default()
+    }
+}

@@ -1,0 +1,179 @@
+//! Every recording can be verified exactly: exit 0 when nothing was lost, 3 with the spans listed after kills,
+//! 1 with scan and variable when something differs.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+mod support;
+
+use rustix::process::Signal;
+use std::path::Path;
+use std::process::Output;
+use std::thread::sleep;
+use std::time::Duration;
+use support::modbus::Client;
+use support::{Scratch, Stack, dinrail, free_port};
+
+fn text(port: u16) -> String {
+    format!(
+        r#"
+[stack]
+name = "NAME"
+
+[[service]]
+name = "rec"
+kind = "recorder"
+dir = "recordings"
+restart = {{ max = 100, within = "10s" }}
+
+[[service]]
+name = "can0"
+kind = "can"
+backend = "virtual"
+feed = {{ file = "conveyor.log", loop = true }}
+
+[[service]]
+name = "io"
+kind = "can-io"
+bus = "can0"
+
+[[service.in]]
+id = 0x1A0
+start = 0
+len = 16
+to = "%IW0"
+type = "UINT"
+symbol = "Speed"
+
+[[service.in]]
+id = 0x0F1
+start = 2
+len = 1
+to = "%IX2.0"
+type = "BOOL"
+symbol = "Barrier"
+
+[[service]]
+name = "plc"
+kind = "plc"
+program = ["main.st"]
+cycle = "5ms"
+restart = {{ max = 100, within = "10s" }}
+
+[[service]]
+name = "modbus"
+kind = "modbus-server"
+tcp = {{ address = "127.0.0.1", port = {port} }}
+"#
+    )
+}
+
+const PROGRAM: &str = "
+PROGRAM main
+VAR CONSTANT Limit : UINT := 1700; END_VAR
+VAR
+  Setpoint AT %MW0 : UINT;
+  Over AT %MX2.0 : BOOL;
+  Parcels AT %MW2 : UINT;
+  Average AT %MD2 : REAL;
+  Edge : R_TRIG;
+  Late : TON;
+END_VAR
+  Edge(CLK := Barrier);
+  IF Edge.Q THEN Parcels := Parcels + 1; END_IF;
+  Average := Average * 0.99 + UINT_TO_REAL(Speed) * 0.01 + SIN(Average) * 0.001;
+  Late(IN := Speed > Limit, PT := T#50ms);
+  Over := Late.Q;
+END_PROGRAM
+";
+
+fn run(name: &str, seconds: f64, mut during: impl FnMut(&Stack, u16)) -> Stack {
+    let port = free_port();
+    let scratch = Scratch::new(name);
+    scratch.write("main.st", PROGRAM);
+    scratch.write("conveyor.log", include_str!("../recordings/conveyor.log"));
+    let mut stack = Stack::spawn_in(name, &text(port), scratch, &[]);
+    stack.wait_ready();
+    during(&stack, port);
+    sleep(Duration::from_secs_f64(seconds));
+    stack.wait_ready();
+    assert_eq!(stack.take_down(), 0, "{}", stack.log());
+    stack
+}
+
+fn verify(recording: &Path, args: &[&str]) -> (i32, serde_json::Value, String) {
+    let output: Output =
+        dinrail().args(["replay", "--verify", "--json"]).arg(recording).args(args).output().unwrap();
+    let said = format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    (output.status.code().unwrap(), serde_json::from_slice(&output.stdout).unwrap_or_default(), said)
+}
+
+#[test]
+fn a_loss_free_recording_verifies_exactly() {
+    let stack = run("verify", 3.0, |_, port| {
+        // Writes by Modbus and forces are inputs like any other.
+        let mut client = Client::connect(port).unwrap();
+        for value in 0..50 {
+            client.write(0, value).unwrap();
+            sleep(Duration::from_millis(7));
+        }
+    });
+    let recordings = stack.recordings();
+    assert_eq!(recordings.len(), 1);
+    let (code, report, said) = verify(&recordings[0], &[]);
+    assert_eq!(code, 0, "{said}");
+    assert!(report["scans_verified"].as_u64().unwrap() > 500, "{said}");
+}
+
+#[test]
+fn forces_starts_and_stops_verify_too() {
+    let stack = run("forces", 0.5, |stack, _| {
+        stack.ok(&["plc", "force", "Speed=1999"]);
+        sleep(Duration::from_millis(200));
+        stack.ok(&["plc", "stop"]);
+        sleep(Duration::from_millis(100));
+        stack.ok(&["plc", "run"]);
+        stack.ok(&["plc", "unforce", "Speed"]);
+        stack.ok(&["plc", "warm"]);
+        sleep(Duration::from_millis(200));
+        stack.ok(&["plc", "cold"]);
+    });
+    let (code, _, said) = verify(&stack.recordings()[0], &[]);
+    assert_eq!(code, 0, "{said}");
+}
+
+#[test]
+fn a_changed_constant_is_named_by_scan_and_variable() {
+    let stack = run("constant", 6.0, |_, _| {});
+    let other = stack.scratch.write("other.st", PROGRAM.replace("1700", "1500"));
+    let (code, report, said) = verify(&stack.recordings()[0], &["--program", other.to_str().unwrap()]);
+    assert_eq!(code, 1, "{said}");
+    let difference = &report["first_difference"];
+    assert!(difference["scan"].as_u64().is_some(), "{said}");
+    assert!(difference["variable"].as_str().unwrap().to_lowercase().contains("late"), "{said}");
+}
+
+#[test]
+fn after_kills_the_spans_are_listed_and_99_of_100_scans_verified() {
+    let stack = run("kills", 4.0, |stack, _| {
+        sleep(Duration::from_secs(3));
+        for victim in ["rec", "plc", "rec"] {
+            let generation = stack.generation(victim);
+            stack.kill(victim, Signal::KILL);
+            stack.wait_generation_above(victim, generation);
+            sleep(Duration::from_secs(3));
+        }
+    });
+    let (mut verified, mut total) = (0, 0);
+    let recordings = stack.recordings();
+    assert_eq!(recordings.len(), 3, "one a life of the recorder");
+    for recording in &recordings {
+        let (code, report, said) = verify(recording, &[]);
+        assert!(code == 0 || code == 3, "{}: exit {code}\n{said}", recording.display());
+        if code == 3 {
+            assert!(!report["unverifiable"].as_array().unwrap().is_empty(), "{said}");
+        }
+        verified += report["scans_verified"].as_u64().unwrap();
+        total += report["scans_total"].as_u64().unwrap();
+    }
+    assert!(verified as f64 >= 0.99 * total as f64, "{verified} of {total} scans verified");
+    assert!(total > 2000, "{total}");
+}
