@@ -46,7 +46,7 @@ fn a_range_owned_twice_names_both_lines() {
     );
     let (code, said) = check(&text, &[]);
     assert_eq!(code, 1, "{said}");
-    says(&said, &["stack.toml:15", "stack.toml:21", "%IW0"]);
+    says(&said, &["line 15", "line 21", "%IB0"]);
 }
 
 #[test]

@@ -140,7 +140,7 @@ impl TopicKind {
         match self {
             Self::CanRx => row("rx", CanFrame::NAME, 4096, 0, Oldest, false, true),
             Self::CanTx => row("tx", CanFrame::NAME, 1024, 0, Refuse, false, false),
-            Self::Inputs => row("inputs", Inputs::NAME, 4, 4096, Oldest, true, true),
+            Self::Inputs => row("inputs", Inputs::NAME, 256, 4096, Oldest, true, true),
             Self::Image => row("image", Image::NAME, 2, 3 * 4096, Oldest, true, false),
             Self::Writes => row("writes", ImageWrite::NAME, 256, 512, Refuse, false, false),
             Self::Scan => row("scan", ScanPart::NAME, 4096, PART_BYTES as u32, Oldest, false, true),

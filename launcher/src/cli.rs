@@ -95,7 +95,7 @@ pub enum Command {
         /// Number of scans
         #[arg(long, required_unless_present = "case")]
         scans: Option<u64>,
-        /// Set a variable before a scan (the first is 0)
+        /// Set a variable before a scan; the first scan is 1
         #[arg(long, value_name = "SCAN:VAR=VALUE")]
         set: Vec<String>,
     },
@@ -151,6 +151,8 @@ pub enum Command {
     },
     /// JSON schema of stack files, for editors
     Schema,
+    /// Measure this machine, each figure beside its goal
+    Bench(crate::commands::bench::BenchArgs),
     #[command(name = "__service", hide = true)]
     Service(ServiceArgs),
     #[command(name = "__clean", hide = true)]
@@ -201,6 +203,16 @@ pub enum PlcCommand {
     Cold,
     /// Start with RETAIN kept
     Warm,
+    /// Start with everything kept
+    Hot,
+    /// Run another program; RETAIN is kept when its layout is the same
+    Load {
+        /// Source or .wasm file
+        program: PathBuf,
+        /// Start it with RETAIN initial as well
+        #[arg(long)]
+        cold: bool,
+    },
     /// Hold a variable or %-address at a value, whatever the program writes
     Force {
         #[arg(required = true, value_name = "VAR=VALUE")]

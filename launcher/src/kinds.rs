@@ -3,10 +3,10 @@
 //! This is the only place of the launcher that knows service crates by name. It must never know what is in a
 //! service's configuration: that is read, checked and wired through the three functions every crate exports.
 
-use ipc_types::stack::{Finding, ServiceEntry, Stack};
-use ipc_types::wiring::{Neighbours, Wiring};
 use crate::explain_keys::{self as docs, KeyDoc};
 use ipc_types::Context;
+use ipc_types::stack::{Finding, ServiceEntry, Stack};
+use ipc_types::wiring::{Neighbours, Wiring};
 use serde::de::DeserializeOwned;
 use toml_edit::{DocumentMut, Table};
 

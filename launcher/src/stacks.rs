@@ -104,11 +104,7 @@ mod tests {
 
     #[test]
     fn nothing_is_overwritten() {
-        let ready = ReadyStack {
-            name: "t",
-            about: "",
-            files: &[("a.txt", b"a"), ("sub/b.txt", b"b")],
-        };
+        let ready = ReadyStack { name: "t", about: "", files: &[("a.txt", b"a"), ("sub/b.txt", b"b")] };
         let dir = std::env::temp_dir().join(format!("dinrail-stacks-{}", std::process::id()));
         let _ = std::fs::remove_dir_all(&dir);
         ready.write_to(&dir).unwrap();

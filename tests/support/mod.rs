@@ -3,6 +3,7 @@
 
 pub mod modbus;
 pub mod peers;
+pub mod socketcand;
 
 use serde_json::Value;
 use std::fs;
@@ -126,6 +127,7 @@ impl Stack {
             .arg("up")
             .arg(&file)
             .args(args)
+            .env("DINRAIL_INJECT", "1")
             .stdout(log.try_clone().unwrap())
             .stderr(log)
             .spawn()
@@ -165,7 +167,7 @@ impl Stack {
     pub fn ps(&self) -> Vec<Value> {
         let output = self.cli(&["ps", "--json"]);
         let value: Value = serde_json::from_slice(&output.stdout).unwrap_or(Value::Null);
-        value["services"].as_array().cloned().unwrap_or_default()
+        value.as_array().cloned().unwrap_or_default()
     }
 
     pub fn service(&self, name: &str) -> Option<Value> {
@@ -181,13 +183,13 @@ impl Stack {
     }
 
     pub fn is_ready(&self, name: &str) -> bool {
-        self.service(name).is_some_and(|row| row["state"] == "ready")
+        self.service(name).is_some_and(|row| row["health"] == "ready" && row["state"] == "running")
     }
 
     pub fn wait_ready(&self) {
         self.wait("all services ready", || {
             let rows = self.ps();
-            (!rows.is_empty() && rows.iter().all(|row| row["state"] == "ready")).then_some(())
+            (!rows.is_empty() && rows.iter().all(|row| row["health"] == "ready" && row["state"] == "running")).then_some(())
         });
     }
 
@@ -195,7 +197,7 @@ impl Stack {
     pub fn wait_generation_above(&self, name: &str, generation: u64) {
         self.wait(&format!("{name} back at work after generation {generation}"), || {
             let row = self.service(name)?;
-            (row["generation"].as_u64()? > generation && row["state"] == "ready").then_some(())
+            (row["generation"].as_u64()? > generation && row["health"] == "ready" && row["state"] == "running").then_some(())
         });
     }
 

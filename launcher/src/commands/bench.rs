@@ -291,7 +291,14 @@ mod tests {
         bench.note("something to know");
         let machine = Machine { cpu: "x".into(), cores: 2, kernel: "6.1".into(), load: 0.5 };
         let report = Report { machine, figures: bench.figures, notes: bench.notes };
-        insta::assert_snapshot!(report_text(&report), @"");
+        insta::assert_snapshot!(report_text(&report), @r"
+        BENCH  FIGURE      VALUE             GOAL
+        bus    frames      123,457 frames/s  >= 100,000 frames/s  met
+        bus    lost        3                 <= 0                 MISSED
+        bus    driver CPU  41.3 %
+        note: bus: something to know
+        machine: x, 2 cores, Linux 6.1, load 0.50 before
+        ");
         let text = serde_json::to_string(&report).unwrap();
         assert_eq!(serde_json::from_str::<Report>(&text).unwrap(), report);
     }

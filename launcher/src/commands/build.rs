@@ -18,8 +18,9 @@ fn read_source(file: &Path) -> anyhow::Result<Source> {
     let size = std::fs::metadata(file).with_context(|| format!("cannot read {shown}"))?.len();
     anyhow::ensure!(size <= SOURCE_MAX, "{shown} has {size} bytes; a source file has at most {SOURCE_MAX}");
     let bytes = std::fs::read(file).with_context(|| format!("cannot read {shown}"))?;
-    let text = String::from_utf8(bytes)
-        .map_err(|e| anyhow::anyhow!("{shown}: byte {} is no UTF-8; is this a source file?", e.utf8_error().valid_up_to()))?;
+    let text = String::from_utf8(bytes).map_err(|e| {
+        anyhow::anyhow!("{shown}: byte {} is no UTF-8; is this a source file?", e.utf8_error().valid_up_to())
+    })?;
     Ok(Source { name: shown.to_string(), text })
 }
 

@@ -2,7 +2,7 @@
 
 use super::{UsageError, println};
 use crate::cli::CanCommand;
-use crate::supervise::client::find;
+use crate::supervise::client::{find, observe};
 use dinrail_can::protocol::candump;
 use dinrail_can::protocol::frame::Frame;
 use ipc_types::payload::{CanFrame, can_flag};
@@ -21,7 +21,7 @@ const ECHO_LIMIT: Duration = Duration::from_secs(2);
 pub fn run(command: CanCommand, json: bool) -> anyhow::Result<()> {
     match command {
         CanCommand::Dump { bus, count, duration, which } => {
-            let ctx = Context::observer(&find(which.stack.as_deref())?.root)?;
+            let ctx = observe(&find(which.stack.as_deref())?)?;
             dump(&ctx, &bus, count, duration.map(|d| d.duration()), json)
         }
         CanCommand::Send { bus, frames, which } => {
@@ -30,7 +30,7 @@ pub fn run(command: CanCommand, json: bool) -> anyhow::Result<()> {
             for text in &frames {
                 parsed.push(candump::parse(text).map_err(|e| UsageError(e.to_string()))?);
             }
-            let mut ctx = Context::observer(&find(which.stack.as_deref())?.root)?;
+            let mut ctx = observe(&find(which.stack.as_deref())?)?;
             send(&mut ctx, &bus, &parsed, json)
         }
     }
@@ -50,7 +50,13 @@ fn topic(ctx: &Context, bus: &str, kind: TopicKind) -> anyhow::Result<String> {
     anyhow::bail!("stack '{}' has no CAN bus '{bus}'; it has {}", ctx.stack.name, buses.join(", "))
 }
 
-fn dump(ctx: &Context, bus: &str, count: Option<u64>, limit: Option<Duration>, json: bool) -> anyhow::Result<()> {
+fn dump(
+    ctx: &Context,
+    bus: &str,
+    count: Option<u64>,
+    limit: Option<Duration>,
+    json: bool,
+) -> anyhow::Result<()> {
     let mut rx = ctx.subscriber::<CanFrame>(&topic(ctx, bus, TopicKind::CanRx)?)?;
     let mut reactor = Reactor::new()?;
     reactor.add_timer(LOOK)?;
@@ -132,7 +138,8 @@ fn send(ctx: &mut Context, bus: &str, frames: &[Frame], json: bool) -> anyhow::R
                 );
             }
             rx.drain(BATCH, |seen, _| {
-                let same = seen.can_id == message.can_id && seen.len == message.len && seen.data == message.data;
+                let same =
+                    seen.can_id == message.can_id && seen.len == message.len && seen.data == message.data;
                 if same && seen.flags & can_flag::TX_ECHO != 0 {
                     echo = Some(*seen);
                 }

@@ -101,3 +101,35 @@ fn to_json(result: &Result<Loaded, LoadError>) -> serde_json::Value {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::stackfile::real_tests::{Folder, STACK};
+
+    #[test]
+    fn a_right_stack_is_summed_up() {
+        let folder = Folder::new("check");
+        let text = STACK.replacen("name = \"real\"", "name = \"real\"\ndescription = \"One of all.\"", 1);
+        let loaded = folder.load(&text).unwrap();
+        let shown = summary(&loaded);
+        assert!(shown.starts_with("stack 'real': 5 services, "), "{shown}");
+        assert!(shown.contains("\n  One of all.\n  can0 "), "{shown}");
+        assert!(shown.contains("modbus-server  tcp 127.0.0.1:1502"), "{shown}");
+        assert!(shown.ends_with("no mistakes found"), "{shown}");
+        let json = to_json(&Ok(loaded));
+        assert_eq!(json["ok"], true);
+        assert_eq!(json["services"][3]["listeners"][0]["address"], "127.0.0.1:1502");
+        assert!(json["shared_memory_bytes"].as_u64().unwrap() > 1 << 20);
+    }
+
+    #[test]
+    fn a_wrong_stack_is_told_with_its_places() {
+        let folder = Folder::new("check-wrong");
+        let error = folder.load(&STACK.replacen("kind = \"plc\"", "kind = \"pcl\"", 1)).unwrap_err();
+        assert_eq!(verdict(&error), "1 error; the stack cannot be started");
+        let json = to_json(&Err(error));
+        assert_eq!((json["ok"].as_bool(), json["findings"][0]["line"].as_u64()), (Some(false), Some(30)));
+        assert_eq!(json["findings"][0]["severity"], "error");
+    }
+}

@@ -7,7 +7,7 @@ use anyhow::Context as _;
 use std::time::Duration;
 
 /// Every service may take its `stop_timeout`; then the launcher kills it.
-const LIMIT: Duration = Duration::from_secs(60);
+const LIMIT: Duration = Duration::from_mins(1);
 
 /// Stops a stack and returns when nothing of it is left.
 pub fn run(which: &Which, json: bool) -> anyhow::Result<()> {

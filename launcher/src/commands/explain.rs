@@ -48,7 +48,7 @@ fn overview() -> String {
 
 /// The keys meant: a whole table, a key of a named table, or a key of any table by its path or last part.
 fn lookup(asked: &str) -> Vec<(&'static str, &'static KeyDoc)> {
-    let asked = general(asked.trim());
+    let asked = plain(&general(asked.trim()));
     let tables = tables();
     let all = |docs: &'static [KeyDoc]| docs.iter().collect::<Vec<_>>();
     if let Some((table, docs)) = tables.iter().find(|(t, _)| *t == asked) {
@@ -69,14 +69,18 @@ fn lookup(asked: &str) -> Vec<(&'static str, &'static KeyDoc)> {
     every().filter(|(_, d)| last_part(d.key) == asked).collect()
 }
 
+/// A key without the marks of lists, which some shells expand: `in[].to` is asked for as `in.to`.
+fn plain(key: &str) -> String {
+    key.replace("[]", "")
+}
+
 /// A key and, for a table, the keys in it.
 fn with_inner(
     key: &str,
     docs: impl Iterator<Item = (&'static str, &'static KeyDoc)>,
 ) -> Vec<(&'static str, &'static KeyDoc)> {
-    let inner = |doc: &KeyDoc| {
-        doc.key.strip_prefix(key).is_some_and(|r| r.is_empty() || r.starts_with('.') || r.starts_with('['))
-    };
+    let inner =
+        |doc: &KeyDoc| plain(doc.key).strip_prefix(key).is_some_and(|r| r.is_empty() || r.starts_with('.'));
     docs.filter(|(_, d)| inner(d)).collect()
 }
 
@@ -117,9 +121,14 @@ fn unknown(asked: &str) -> String {
         return format!("{table} has no key '{key}'; {}", suggestion(key, "keys", keys).replace('\n', " "));
     }
     keys.extend(&words);
-    keys.extend(tables.iter().flat_map(|(_, docs)| docs.iter().map(|d| last_part(d.key))).collect::<Vec<_>>());
+    keys.extend(
+        tables.iter().flat_map(|(_, docs)| docs.iter().map(|d| last_part(d.key))).collect::<Vec<_>>(),
+    );
     let near = nearest(asked, keys).map(|n| format!("did you mean '{n}'? ")).unwrap_or_default();
-    format!("no key is called '{asked}'; {near}`dinrail explain WORD` lists keys, WORD being {}", words.join(", "))
+    format!(
+        "no key is called '{asked}'; {near}`dinrail explain WORD` lists keys, WORD being {}",
+        words.join(", ")
+    )
 }
 
 /// JSON Schema (draft 7) of stack files, for editors: taplo reads it from `#:schema PATH` in the first line.
@@ -210,6 +219,8 @@ mod tests {
         assert_eq!(found("modbus-server.tcp.port"), ["modbus-server.tcp.port"]);
         assert_eq!(found("port"), ["modbus-server.tcp.port"]);
         assert_eq!(found("can-io.in[3].to"), ["can-io.in[].to"]);
+        assert_eq!(found("can-io.out.signals.from"), ["can-io.out[].signals[].from"]);
+        assert!(found("can-io.in").contains(&"can-io.in[].to".to_owned()));
         assert_eq!(found("can.critical"), ["service.critical"]);
         assert_eq!(found("stack").len(), STACK_DOCS.len());
         assert!(found("restart").contains(&"service.restart.on_exhausted".to_owned()));
@@ -245,8 +256,12 @@ mod tests {
         for (kind, service) in KINDS.iter().zip(services) {
             let mut there = Vec::new();
             paths(service, "", &mut there);
-            let mut documented: Vec<String> =
-                SERVICE_DOCS.iter().chain(kind.config_doc).map(|d| d.key.to_owned()).filter(|k| k != "exec").collect();
+            let mut documented: Vec<String> = SERVICE_DOCS
+                .iter()
+                .chain(kind.config_doc)
+                .map(|d| d.key.to_owned())
+                .filter(|k| k != "exec")
+                .collect();
             there.sort();
             documented.sort();
             assert_eq!(there, documented, "{}", kind.name);

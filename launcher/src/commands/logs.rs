@@ -15,7 +15,12 @@ pub fn run(service: Option<&str>, lines: u32, follow: bool, which: &Which, json:
         match reply {
             Reply::Log(line) if json => super::println(&serde_json::to_string(&line)?),
             Reply::Log(line) => {
-                super::println(&format!("{} {:<10} | {}", logbook::clock(line.utc_ns), line.service, line.line));
+                super::println(&format!(
+                    "{} {:<10} | {}",
+                    logbook::clock(line.utc_ns),
+                    line.service,
+                    line.line
+                ));
             }
             _ => break,
         }

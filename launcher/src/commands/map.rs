@@ -7,6 +7,7 @@ use dinrail_iec::artifact::{AreaKind, Storage, VarKind};
 use dinrail_modbus::address::{Address, Addressing, AreaSizes, Width};
 use dinrail_modbus::map::RegisterMap;
 use dinrail_modbus::map_config::{MapConfig, MapRow, traditional_number};
+use dinrail_modbus::server::Table;
 use dinrail_plc::program;
 use ipc_types::Stack;
 use ipc_types::stack::ServiceEntry;
@@ -58,6 +59,9 @@ struct Register {
     address: u16,
     /// From 1, with the digit of the table: 40001.
     number: String,
+    /// For a bit that only a register shows: its number there, 0 to 15.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    bit: Option<u8>,
 }
 
 /// Registers of one server, for what no field service exchanges.
@@ -189,6 +193,30 @@ fn maps_of(
     Ok(maps)
 }
 
+/// Where a map shows an address: as a bit or a register, else as a bit of a register.
+fn registers(server: Option<&String>, map: &RegisterMap, address: Address) -> Vec<Register> {
+    let register = |(table, at): (Table, u16), bit| Register {
+        server: server.cloned(),
+        table: table.name(),
+        address: at,
+        number: traditional_number(table, at),
+        bit,
+    };
+    let direct: Vec<Register> =
+        map.entries_at(address).into_iter().map(|entry| register(entry, None)).collect();
+    if !direct.is_empty() || address.width != Width::Bit {
+        return direct;
+    }
+    let word = Address { width: Width::Word, byte: address.byte & !1, bit: 0, ..address };
+    let rows = map.rows(Addressing::Element);
+    let swapped = |(table, at)| {
+        rows.iter().any(|r| r.table == table && r.swap_bytes && (r.first..=r.last).contains(&at))
+    };
+    let bit = (address.byte % 2) as u8 * 8 + address.bit;
+    let entries = map.entries_at(word).into_iter();
+    entries.map(|entry| register(entry, Some(if swapped(entry) { bit ^ 8 } else { bit }))).collect()
+}
+
 fn point(
     plc: &ServiceEntry,
     entry: &ServiceEntry,
@@ -205,18 +233,11 @@ fn point(
         _ => None,
     };
     let address = |width| Address { area: range.area, width, byte: range.byte, bit: range.bit.unwrap_or(0) };
-    let mut modbus = Vec::new();
-    for (server, map) in maps {
-        for (table, at) in map.entries_at(address(width.unwrap_or(Width::Byte))) {
-            modbus.push(Register {
-                server: server.clone(),
-                table: table.name(),
-                address: at,
-                number: traditional_number(table, at),
-            });
-        }
-    }
-    let whole = |w: &Width| range.byte % w.bytes() == 0;
+    let modbus = maps
+        .iter()
+        .flat_map(|(server, map)| registers(server.as_ref(), map, address(width.unwrap_or(Width::Byte))))
+        .collect();
+    let whole = |w: &Width| range.byte.is_multiple_of(w.bytes());
     Point {
         plc: plc.name.clone(),
         element: width.filter(whole).map(|w| address(w).text(Addressing::Element)),
@@ -241,7 +262,8 @@ fn row(point: &Point) -> Vec<String> {
         .iter()
         .map(|r| {
             let server = r.server.as_ref().filter(|_| several).map(|s| format!("{s}: ")).unwrap_or_default();
-            format!("{server}{} {} ({})", r.table, r.address, r.number)
+            let bit = r.bit.map(|b| format!("bit {b} of ")).unwrap_or_default();
+            format!("{server}{bit}{} {} ({})", r.table, r.address, r.number)
         })
         .collect();
     let or_dash = |text: &Option<String>| text.clone().unwrap_or_else(|| "-".to_owned());
@@ -284,7 +306,13 @@ fn text(points: &[Point], servers: &[ServerMap]) -> String {
             .iter()
             .map(|r| {
                 let notes = [
-                    r.word_order.map(|o| if o == dinrail_modbus::map_config::WordOrder::HighFirst { "high word first" } else { "low word first" }),
+                    r.word_order.map(|o| {
+                        if o == dinrail_modbus::map_config::WordOrder::HighFirst {
+                            "high word first"
+                        } else {
+                            "low word first"
+                        }
+                    }),
                     r.swap_bytes.then_some("bytes swapped"),
                     Some(if r.writable { "read, write" } else { "read" }),
                 ];
@@ -323,6 +351,11 @@ mod tests {
             ]
         );
         assert_eq!(servers.len(), 1);
+        let (_, map) =
+            &maps_of(&loaded.stack, loaded.stack.service("plc").unwrap(), AreaSizes::MAX).unwrap()[0];
+        let bit = Address { area: Area::Marker, width: Width::Bit, byte: 7, bit: 2 };
+        let found = registers(None, map, bit);
+        assert_eq!((found[0].number.as_str(), found[0].bit), ("40004", Some(10)));
         assert!(text(&points, &servers).contains("registers of 'modbus' over the image of 'plc'"));
         assert_eq!(text(&[], &[]), "no point matches\n");
     }
@@ -334,6 +367,9 @@ mod tests {
         let loaded = folder.load(&STACK[..at]).unwrap();
         let (points, servers) = collect(&loaded.stack).unwrap();
         assert!(servers.is_empty());
-        assert_eq!((points[0].modbus[0].number.as_str(), points[0].modbus[0].server.as_deref()), ("30001", None));
+        assert_eq!(
+            (points[0].modbus[0].number.as_str(), points[0].modbus[0].server.as_deref()),
+            ("30001", None)
+        );
     }
 }

@@ -1,6 +1,7 @@
 //! The commands, one module each. They parse nothing and supervise nothing: arguments come from [`crate::cli`],
 //! stacks from [`crate::stackfile`], processes from [`crate::supervise`].
 
+pub mod bench;
 mod build;
 mod can;
 mod check;
@@ -12,7 +13,9 @@ mod new;
 mod plc;
 mod ps;
 mod recordings;
+mod replay;
 mod restart;
+mod trace;
 mod up;
 
 use crate::cli::{Cli, Command};
@@ -50,7 +53,15 @@ pub fn run(cli: Cli) -> ExitCode {
         }
         Command::Build { files, output } => done(build::run(&files, &output, json)),
         Command::Recordings(command) => recordings::run(command, json),
-        Command::Trace { .. } | Command::Replay { .. } => Err(anyhow::anyhow!("not supported yet")),
+        Command::Trace { files, case: Some(case), .. } => trace::against_case(&files, &case, json),
+        Command::Trace { files, cycle: Some(cycle), scans: Some(scans), set, .. } => {
+            trace::scans(&files, cycle, scans, &set, json)
+        }
+        Command::Trace { .. } => Err(UsageError("give --case, or --cycle and --scans".to_owned()).into()),
+        Command::Replay { file, program, service, .. } => {
+            let what = replay::Verify { file: &file, program: &program, service: service.as_deref() };
+            replay::verify(&what, json)
+        }
         Command::Check { stack } => return check::run(&stack, json),
         Command::Map { stack, filter } => done(map::run(&stack, filter.as_deref(), json)),
         Command::New { from: Some(from), dir } => done(new::run(&from, dir.as_deref())),
@@ -63,6 +74,7 @@ pub fn run(cli: Cli) -> ExitCode {
             print(&format!("{:#}\n", explain::schema()));
             Ok(ExitCode::SUCCESS)
         }
+        Command::Bench(args) => bench::run(&args, json),
         Command::Service(args) => return service_main::run(&args),
         Command::Clean { root, parent } => return service_main::clean(&root, parent),
     };
@@ -116,7 +128,7 @@ mod tests {
 
     #[test]
     fn columns_are_aligned() {
-        let text = table(&["a", "long"], &[vec!["xyz".into(), "1".into()], vec!["q".into(), "".into()]]);
+        let text = table(&["a", "long"], &[vec!["xyz".into(), "1".into()], vec!["q".into(), String::new()]]);
         assert_eq!(text, "a    long\nxyz  1\nq\n");
     }
 

@@ -1,6 +1,6 @@
 //! `dinrail new --from STACK [DIR]`: a ready stack as a starting point of one's own.
 
-use super::print;
+use super::{print, table};
 use crate::stackfile::suggestion;
 use crate::stacks::{self, STACKS};
 use std::path::{Path, PathBuf};
@@ -21,7 +21,8 @@ pub fn run(from: &str, dir: Option<&Path>) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The ready stacks, one a line.
+/// The ready stacks as a table.
 pub fn list() -> String {
-    STACKS.iter().map(|s| format!("{:<12} {}\n", s.name, s.about)).collect()
+    let rows: Vec<Vec<String>> = STACKS.iter().map(|s| vec![s.name.to_owned(), s.about.to_owned()]).collect();
+    table(&["STACK", "WHAT IT IS"], &rows)
 }

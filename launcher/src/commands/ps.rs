@@ -120,7 +120,9 @@ mod tests {
 
     #[test]
     fn times_are_short() {
-        for (ms, text) in [(950, "950 ms"), (12_000, "12 s"), (7_620_000, "2 h 7 min"), (356_400_000, "4 d 3 h")] {
+        for (ms, text) in
+            [(950, "950 ms"), (12_000, "12 s"), (7_620_000, "2 h 7 min"), (356_400_000, "4 d 3 h")]
+        {
             assert_eq!(uptime(ms), text);
         }
     }

@@ -32,7 +32,8 @@ pub fn demo(dir: &Path, duration: Option<Span>, json: bool) -> anyhow::Result<Ex
         ready.write_to(dir)?;
     }
     let loaded = load(dir)?;
-    let tour = std::fs::read_to_string(dir.join(TOUR)).ok().filter(|_| !json).map(|text| paste_ready(&text, dir));
+    let tour =
+        std::fs::read_to_string(dir.join(TOUR)).ok().filter(|_| !json).map(|text| paste_ready(&text, dir));
     let options = Options { duration: duration.map(|d| d.duration()), progress: true, json, tour };
     run(loaded, &options)
 }
@@ -41,7 +42,8 @@ pub fn demo(dir: &Path, duration: Option<Span>, json: bool) -> anyhow::Result<Ex
 fn paste_ready(text: &str, dir: &Path) -> String {
     let exe = std::env::current_exe().unwrap_or_else(|_| "dinrail".into());
     let here = std::env::current_dir().unwrap_or_default();
-    let shown = exe.strip_prefix(&here).map_or_else(|_| exe.display().to_string(), |p| format!("./{}", p.display()));
+    let shown =
+        exe.strip_prefix(&here).map_or_else(|_| exe.display().to_string(), |p| format!("./{}", p.display()));
     text.replace("{dinrail}", &shown).replace("{folder}", &dir.display().to_string())
 }
 

@@ -1,5 +1,6 @@
 //! Keys of the services at the field side.
 
+#[allow(clippy::enum_glob_use, reason = "tables of one line a key")]
 use super::ValueKind::*;
 use super::{KeyDoc, may, need, with};
 
@@ -7,26 +8,75 @@ const PORT_FORMS: super::ValueKind = OneOf(&[Socket, Table]);
 
 /// Keys of kind `can`.
 pub const CAN: &[KeyDoc] = &[
-    need("backend", Choice(&["virtual", "socketcan", "slcan", "socketcand"]), "What stands between the driver and the wire. \"virtual\" is a bus inside the driver process; the others are not supported yet."),
-    may("interface", Text, "none", "Network interface or device of the backend; without meaning for \"virtual\"."),
-    may("number", Int(0, u32::MAX as i64), "the order in the stack file", "Number of the bus for blocks that name a bus by number."),
+    need(
+        "backend",
+        Choice(&["virtual", "socketcan", "slcan", "socketcand"]),
+        "What stands between the driver and the wire. \"virtual\" is a bus inside the driver process; the others are not supported yet.",
+    ),
+    may(
+        "interface",
+        Text,
+        "none",
+        "Network interface or device of the backend; without meaning for \"virtual\".",
+    ),
+    may(
+        "number",
+        Int(0, u32::MAX as i64),
+        "the order in the stack file",
+        "Number of the bus for blocks that name a bus by number.",
+    ),
     with("bitrate", BitRate, "\"500k\"", "Nominal bit rate, 5k to 1M."),
     with("data_bitrate", BitRate, "\"2M\"", "Bit rate of the data phase of CAN FD, from `bitrate` up to 8M."),
-    with("pace", Bool, "false", "Hold frames of a virtual bus to the time they would take on a wire at `bitrate`; else as fast as it goes."),
-    with("max_rate", Int(100, 10_000_000), "150000", "Without `pace`: most frames a second on a virtual bus, so that no reader loses any."),
-    with("tx_queue", Int(1, 4096), "512", "Frames of the stack that wait for the bus; when it is full, senders are refused."),
-    with("client_buffer", Size, "\"1MiB\"", "Bytes that wait for one TCP client, 4KiB to 64MiB; a client that reads too slowly is dropped."),
+    with(
+        "pace",
+        Bool,
+        "false",
+        "Hold frames of a virtual bus to the time they would take on a wire at `bitrate`; else as fast as it goes.",
+    ),
+    with(
+        "max_rate",
+        Int(100, 10_000_000),
+        "150000",
+        "Without `pace`: most frames a second on a virtual bus, so that no reader loses any.",
+    ),
+    with(
+        "tx_queue",
+        Int(1, 4096),
+        "512",
+        "Frames of the stack that wait for the bus; when it is full, senders are refused.",
+    ),
+    with(
+        "client_buffer",
+        Size,
+        "\"1MiB\"",
+        "Bytes that wait for one TCP client, 4KiB to 64MiB; a client that reads too slowly is dropped.",
+    ),
     with("serve", Table, "{}", "Servers for foreign tools such as python-can."),
-    may("serve.socketcand", PORT_FORMS, "no server", "Serves the bus by the socketcand protocol at this address."),
+    may(
+        "serve.socketcand",
+        PORT_FORMS,
+        "no server",
+        "Serves the bus by the socketcand protocol at this address.",
+    ),
     need("serve.socketcand.address", Socket, "Where the server listens."),
-    may("serve.socketcand.filter", Table, "loopback only", "Who may connect besides loopback: start <= address <= end, and address & mask = start & mask. Required unless the server listens on loopback."),
+    may(
+        "serve.socketcand.filter",
+        Table,
+        "loopback only",
+        "Who may connect besides loopback: start <= address <= end, and address & mask = start & mask. Required unless the server listens on loopback.",
+    ),
     need("serve.socketcand.filter.mask", Ip, "Bits of the address that must equal those of `start`."),
     need("serve.socketcand.filter.start", Ip, "First address that may connect."),
     need("serve.socketcand.filter.end", Ip, "Last address that may connect."),
     with("serve.socketcand.max_clients", Int(1, 32), "8", "Most clients at once."),
     may("serve.slcan", PORT_FORMS, "no server", "Serves the bus as SLCAN over TCP at this address."),
     need("serve.slcan.address", Socket, "Where the server listens."),
-    may("serve.slcan.filter", Table, "loopback only", "Who may connect besides loopback: start <= address <= end, and address & mask = start & mask. Required unless the server listens on loopback."),
+    may(
+        "serve.slcan.filter",
+        Table,
+        "loopback only",
+        "Who may connect besides loopback: start <= address <= end, and address & mask = start & mask. Required unless the server listens on loopback.",
+    ),
     need("serve.slcan.filter.mask", Ip, "Bits of the address that must equal those of `start`."),
     need("serve.slcan.filter.start", Ip, "First address that may connect."),
     need("serve.slcan.filter.end", Ip, "Last address that may connect."),
@@ -41,24 +91,52 @@ pub const CAN: &[KeyDoc] = &[
 
 /// Types of a point.
 const TYPES: &[&str] = &[
-    "BOOL", "SINT", "INT", "DINT", "LINT", "USINT", "UINT", "UDINT", "ULINT", "REAL", "LREAL", "BYTE", "WORD",
-    "DWORD", "LWORD",
+    "BOOL", "SINT", "INT", "DINT", "LINT", "USINT", "UINT", "UDINT", "ULINT", "REAL", "LREAL", "BYTE",
+    "WORD", "DWORD", "LWORD",
 ];
 const ORDERS: super::ValueKind = Choice(&["intel", "motorola"]);
 const ID: super::ValueKind = OneOf(&[Int(0, 0x1FFF_FFFF), Text]);
 
 /// Keys of kind `can-io`.
 pub const CAN_IO: &[KeyDoc] = &[
-    may("bus", Service("can"), "the only bus of the stack", "The can service whose frames are taken and sent."),
+    may(
+        "bus",
+        Service("can"),
+        "the only bus of the stack",
+        "The can service whose frames are taken and sent.",
+    ),
     may("plc", Service("plc"), "the only plc of the stack", "The plc service whose image is exchanged."),
-    with("addressing", Choice(&["element", "byte", "openplc"]), "\"element\"", "How %-addresses of this table count; as the same key of the plc service."),
+    with(
+        "addressing",
+        Choice(&["element", "byte", "openplc"]),
+        "\"element\"",
+        "How %-addresses of this table count; as the same key of the plc service.",
+    ),
     with("echo", Bool, "false", "Take frames that the stack itself sent, too."),
-    with("stale_after", Duration, "\"200ms\"", "Age of the image above which the frames sent go to their safe state."),
-    with("safe_on", List(&Choice(&["stop", "fault", "halted"])), "[\"stop\", \"fault\", \"halted\"]", "States of the plc in which the frames sent go to their safe state; a stale image always does."),
+    with(
+        "stale_after",
+        Duration,
+        "\"200ms\"",
+        "Age of the image above which the frames sent go to their safe state.",
+    ),
+    with(
+        "safe_on",
+        List(&Choice(&["stop", "fault", "halted"])),
+        "[\"stop\", \"fault\", \"halted\"]",
+        "States of the plc in which the frames sent go to their safe state; a stale image always does.",
+    ),
     with("in", Tables, "[]", "Signals taken from the bus into %I, one [[service.in]] each; at most 1024."),
-    need("in[].id", ID, "Identifier of the frame: a number, or hex digits as text; eight digits mean 29 bits."),
+    need(
+        "in[].id",
+        ID,
+        "Identifier of the frame: a number, or hex digits as text; eight digits mean 29 bits.",
+    ),
     may("in[].ext", Bool, "by the identifier", "true: 29-bit identifier."),
-    need("in[].start", Int(0, 511), "First bit of the signal in DBC numbering: the least significant for intel, the most significant for motorola."),
+    need(
+        "in[].start",
+        Int(0, 511),
+        "First bit of the signal in DBC numbering: the least significant for intel, the most significant for motorola.",
+    ),
     need("in[].len", Int(1, 64), "Bits of the signal."),
     with("in[].order", ORDERS, "\"intel\"", "Order of the bytes: intel = low byte first."),
     with("in[].signed", Bool, "false", "The raw value is two's complement."),
@@ -69,19 +147,37 @@ pub const CAN_IO: &[KeyDoc] = &[
     may("in[].type", Choice(TYPES), "by the width of `to` and `signed`", "IEC type of the value."),
     may("in[].symbol", Text, "none", "Name of a global variable for the program."),
     may("in[].timeout", Duration, "never", "A value older than this is bad."),
-    with("in[].on_bad", OneOf(&[Choice(&["hold", "zero"]), Number]), "\"hold\"", "Value while bad: the last good one, zero, or this number in the unit of the value."),
+    with(
+        "in[].on_bad",
+        OneOf(&[Choice(&["hold", "zero"]), Number]),
+        "\"hold\"",
+        "Value while bad: the last good one, zero, or this number in the unit of the value.",
+    ),
     may("in[].status_to", Address, "not shown", "%IB that shows the quality of the value to the program."),
     with("out", Tables, "[]", "Frames sent, one [[service.out]] each; at most 256."),
-    need("out[].id", ID, "Identifier of the frame: a number, or hex digits as text; eight digits mean 29 bits."),
+    need(
+        "out[].id",
+        ID,
+        "Identifier of the frame: a number, or hex digits as text; eight digits mean 29 bits.",
+    ),
     may("out[].ext", Bool, "by the identifier", "true: 29-bit identifier."),
     need("out[].dlc", Int(0, 64), "Bytes of the frame: 0 to 8; for CAN FD also 12, 16, 20, 24, 32, 48, 64."),
     may("out[].fd", Bool, "when `dlc` is above 8", "Send a CAN FD frame."),
     with("out[].brs", Bool, "false", "CAN FD with bit rate switch."),
-    need("out[].mode", Choice(&["on_change", "cyclic"]), "When the frame is sent: when a bit of it changed after a scan, or every `period`."),
+    need(
+        "out[].mode",
+        Choice(&["on_change", "cyclic"]),
+        "When the frame is sent: when a bit of it changed after a scan, or every `period`.",
+    ),
     may("out[].period", Duration, "only for on_change", "For cyclic: time between two frames, at least 1ms."),
     with("out[].inhibit", Duration, "\"0ms\"", "For on_change: least time between two frames."),
     with("out[].fill", Int(0, 255), "0", "Value of the bytes' bits that no signal covers."),
-    with("out[].on_stop", OneOf(&[Choice(&["silent", "hold", "not_available"]), Table]), "\"silent\"", "Safe state of the frame: nothing is sent so that the receiver's own timeout fires; the last values go on; all signals have all bits 1; or these values."),
+    with(
+        "out[].on_stop",
+        OneOf(&[Choice(&["silent", "hold", "not_available"]), Table]),
+        "\"silent\"",
+        "Safe state of the frame: nothing is sent so that the receiver's own timeout fires; the last values go on; all signals have all bits 1; or these values.",
+    ),
     need("out[].on_stop.values", List(&Number), "One number per signal, in its unit."),
     with("out[].signals", Tables, "[]", "Signals in the frame; at most 64."),
     need("out[].signals[].start", Int(0, 511), "First bit of the signal in DBC numbering."),
@@ -92,6 +188,11 @@ pub const CAN_IO: &[KeyDoc] = &[
     with("out[].signals[].scale", Number, "1.0", "Value = raw * scale + offset."),
     with("out[].signals[].offset", Number, "0.0", "Value = raw * scale + offset."),
     need("out[].signals[].from", Address, "Place in %Q or %M."),
-    may("out[].signals[].type", Choice(TYPES), "by the width of `from` and `signed`", "IEC type of the value."),
+    may(
+        "out[].signals[].type",
+        Choice(TYPES),
+        "by the width of `from` and `signed`",
+        "IEC type of the value.",
+    ),
     may("out[].signals[].symbol", Text, "none", "Name of a global variable for the program."),
 ];

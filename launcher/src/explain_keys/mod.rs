@@ -162,37 +162,121 @@ pub fn general(path: &str) -> String {
     if out.ends_with("[]") { out[..out.len() - 2].to_owned() } else { out }
 }
 
+#[allow(clippy::enum_glob_use, reason = "tables of one line a key")]
 use ValueKind::*;
 
 /// Keys of `[stack]`.
 pub const STACK_DOCS: &[KeyDoc] = &[
-    need("name", Text, "Name of the stack: two stacks of one user run side by side when their names differ. 1 to 32 of a-z 0-9 _ -, beginning with a letter."),
+    need(
+        "name",
+        Text,
+        "Name of the stack: two stacks of one user run side by side when their names differ. 1 to 32 of a-z 0-9 _ -, beginning with a letter.",
+    ),
     with("description", Text, "\"\"", "One sentence about the stack, shown by `check`."),
-    with("stop_timeout", Duration, "\"2s\"", "How long a service may take to end at `down` before it is killed."),
-    with("log_level", Choice(&["error", "warn", "info", "debug", "trace"]), "\"info\"", "What the services log; a service's own log_level goes before it."),
-    may("watchdog", File, "none is fed", "Hardware watchdog, e.g. \"/dev/watchdog\": fed only while every critical service is healthy, so that the machine restarts when one stays down."),
+    with(
+        "stop_timeout",
+        Duration,
+        "\"2s\"",
+        "How long a service may take to end at `down` before it is killed.",
+    ),
+    with(
+        "log_level",
+        Choice(&["error", "warn", "info", "debug", "trace"]),
+        "\"info\"",
+        "What the services log; a service's own log_level goes before it.",
+    ),
+    may(
+        "watchdog",
+        File,
+        "none is fed",
+        "Hardware watchdog, e.g. \"/dev/watchdog\": fed only while every critical service is healthy, so that the machine restarts when one stays down.",
+    ),
 ];
 
 /// Keys that every `[[service]]` has; the launcher reads them.
 pub const SERVICE_DOCS: &[KeyDoc] = &[
-    need("name", Text, "Name of the service; its topics, logs and messages carry it. 1 to 32 of a-z 0-9 _ -, beginning with a letter."),
+    need(
+        "name",
+        Text,
+        "Name of the service; its topics, logs and messages carry it. 1 to 32 of a-z 0-9 _ -, beginning with a letter.",
+    ),
     need("kind", Text, "What the service is; `dinrail explain` lists the kinds."),
-    with("restart", Table, "{ max = 5, within = \"10s\" }", "How often a service that died is started again. The first restart comes at once."),
-    with("restart.max", Int(0, u32::MAX as i64), "5", "Restarts allowed within `restart.within`; 0 = it is never started again."),
+    with(
+        "restart",
+        Table,
+        "{ max = 5, within = \"10s\" }",
+        "How often a service that died is started again. The first restart comes at once.",
+    ),
+    with(
+        "restart.max",
+        Int(0, u32::MAX as i64),
+        "5",
+        "Restarts allowed within `restart.within`; 0 = it is never started again.",
+    ),
     with("restart.within", Duration, "\"10s\"", "The time in which `restart.max` restarts are allowed."),
-    with("restart.backoff_first", Duration, "\"50ms\"", "Wait before the second restart in a row; doubled for each further one."),
+    with(
+        "restart.backoff_first",
+        Duration,
+        "\"50ms\"",
+        "Wait before the second restart in a row; doubled for each further one.",
+    ),
     with("restart.backoff_max", Duration, "\"5s\"", "Longest wait before a restart."),
-    with("restart.on_exhausted", Choice(&["hold", "fail-stack"]), "\"hold\"", "What happens when the restarts are used up: the service stays down while its neighbours go on, or the whole stack stops with exit code 1."),
-    with("hang_timeout", Duration, "\"2s\"", "A ready service without a heartbeat for so long is killed and started again; at least 300ms."),
-    with("ready_timeout", Duration, "\"10s\"", "A service that is not ready so long after its start is killed and started again; at least 300ms."),
-    may("nice", Int(-20, 19), "that of the launcher", "Scheduling priority among normal processes: -20 gets most CPU, 19 least. Below 0 needs privilege."),
-    may("priority", Int(1, 99), "normal scheduling", "Real-time priority (SCHED_FIFO); runs before every normal process. Needs privilege (CAP_SYS_NICE or a limit RTPRIO)."),
+    with(
+        "restart.on_exhausted",
+        Choice(&["hold", "fail-stack"]),
+        "\"hold\"",
+        "What happens when the restarts are used up: the service stays down while its neighbours go on, or the whole stack stops with exit code 1.",
+    ),
+    with(
+        "hang_timeout",
+        Duration,
+        "\"2s\"",
+        "A ready service without a heartbeat for so long is killed and started again; at least 300ms.",
+    ),
+    with(
+        "ready_timeout",
+        Duration,
+        "\"10s\"",
+        "A service that is not ready so long after its start is killed and started again; at least 300ms.",
+    ),
+    may(
+        "nice",
+        Int(-20, 19),
+        "that of the launcher",
+        "Scheduling priority among normal processes: -20 gets most CPU, 19 least. Below 0 needs privilege.",
+    ),
+    may(
+        "priority",
+        Int(1, 99),
+        "normal scheduling",
+        "Real-time priority (SCHED_FIFO); runs before every normal process. Needs privilege (CAP_SYS_NICE or a limit RTPRIO).",
+    ),
     with("cpus", List(&Int(0, 1023)), "[]", "CPUs the service may run on; [] = all."),
-    may("memory_limit", Size, "no limit", "Most memory the service may take for its data (RLIMIT_DATA), at least 16MiB; beyond it allocations fail and the service is started again. Shared memory of the rail does not count."),
-    with("critical", Bool, "true", "Whether the hardware watchdog (`stack.watchdog`) stops being fed when this service is down."),
+    may(
+        "memory_limit",
+        Size,
+        "no limit",
+        "Most memory the service may take for its data (RLIMIT_DATA), at least 16MiB; beyond it allocations fail and the service is started again. Shared memory of the rail does not count.",
+    ),
+    with(
+        "critical",
+        Bool,
+        "true",
+        "Whether the hardware watchdog (`stack.watchdog`) stops being fed when this service is down.",
+    ),
     with("env", Texts, "{}", "Variables added to the environment of the service."),
-    may("log_level", Choice(&["error", "warn", "info", "debug", "trace"]), "that of [stack]", "What this service logs."),
-    may("exec", List(&Text), "", "Command line of a foreign program in place of a service of this executable. Not supported yet."),
+    may(
+        "log_level",
+        Choice(&["error", "warn", "info", "debug", "trace"]),
+        "that of [stack]",
+        "What this service logs.",
+    ),
+    may(
+        "exec",
+        List(&Text),
+        "",
+        "Command line of a foreign program in place of a service of this executable. Not supported yet.",
+    ),
 ];
 
 #[cfg(test)]

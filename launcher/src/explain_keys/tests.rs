@@ -31,10 +31,13 @@ fn error_of<T: DeserializeOwned>(value: &Value) -> String {
     T::deserialize(value).err().map_or_else(String::new, |e| e.to_string())
 }
 
+/// What a type says to a value.
+type Ask = fn(&Value) -> String;
+
 /// A table behind an untagged enum hides its keys from serde's message: asked for directly.
-fn hidden(kind: &str, path: &str) -> Option<(usize, fn(&Value) -> String)> {
+fn hidden(kind: &str, path: &str) -> Option<(usize, Ask)> {
     use ipc_types::net::IpFilter;
-    let list: &[(&str, &str, fn(&Value) -> String)] = &[
+    let list: &[(&str, &str, Ask)] = &[
         ("can", "serve.socketcand.filter", error_of::<IpFilter>),
         ("can", "serve.slcan.filter", error_of::<IpFilter>),
         ("can", "serve.socketcand", error_of::<dinrail_can::config::EndpointTable>),
@@ -60,9 +63,11 @@ fn compare(table: &str, docs: &[KeyDoc], accepts: impl Fn(&Value) -> String) {
         }
         let tables = [ValueKind::Table, ValueKind::Tables];
         let has = |forms: &[ValueKind]| forms.iter().any(|f| tables.contains(f));
-        let is_table = tables.contains(&doc.value) || matches!(doc.value, ValueKind::OneOf(forms) if has(forms));
+        let is_table =
+            tables.contains(&doc.value) || matches!(doc.value, ValueKind::OneOf(forms) if has(forms));
         if is_table {
-            let inner = docs.iter().any(|d| d.key.strip_prefix(doc.key).is_some_and(|r| r.starts_with(['.', '['])));
+            let inner =
+                docs.iter().any(|d| d.key.strip_prefix(doc.key).is_some_and(|r| r.starts_with(['.', '['])));
             assert!(inner, "{table}: table '{}' has no documented keys", doc.key);
         }
     }
@@ -77,7 +82,9 @@ fn compare(table: &str, docs: &[KeyDoc], accepts: impl Fn(&Value) -> String) {
         let mut documented = documented;
         let read = match expected(&said, "unknown variant") {
             Some(read) => {
-                if let Some(KeyDoc { value: ValueKind::OneOf(forms), .. }) = docs.iter().find(|d| d.key == prefix) {
+                if let Some(KeyDoc { value: ValueKind::OneOf(forms), .. }) =
+                    docs.iter().find(|d| d.key == prefix)
+                {
                     for form in *forms {
                         if let ValueKind::Choice(words) = form {
                             documented.extend(words.iter().map(|w| (*w).to_owned()));
@@ -86,8 +93,9 @@ fn compare(table: &str, docs: &[KeyDoc], accepts: impl Fn(&Value) -> String) {
                 }
                 read
             }
-            None => expected(&said, "unknown field")
-                .unwrap_or_else(|| panic!("{table}, keys of '{prefix}': expected an unknown field, got '{said}'")),
+            None => expected(&said, "unknown field").unwrap_or_else(|| {
+                panic!("{table}, keys of '{prefix}': expected an unknown field, got '{said}'")
+            }),
         };
         assert_eq!(documented, read, "{table}: keys of '{prefix}'");
     }
@@ -115,17 +123,19 @@ fn compare(table: &str, docs: &[KeyDoc], accepts: impl Fn(&Value) -> String) {
 #[test]
 fn every_key_and_choice_is_documented() {
     for kind in KINDS {
-        compare(kind.name, kind.config_doc, |value| (kind.accepts)(value).err().map_or_else(String::new, |e| e.to_string()));
+        compare(kind.name, kind.config_doc, |value| {
+            (kind.accepts)(value).err().map_or_else(String::new, |e| e.to_string())
+        });
     }
 }
 
 #[test]
 fn the_launchers_keys_are_documented() {
     use crate::stackfile::probe;
-    compare("stack", STACK_DOCS, |v| probe::stack(v));
+    compare("stack", STACK_DOCS, probe::stack);
     let own: Vec<KeyDoc> =
         SERVICE_DOCS.iter().filter(|d| !["name", "kind", "exec"].contains(&d.key)).copied().collect();
-    compare("service", &own, |v| probe::service(v));
+    compare("service", &own, probe::service);
     let documented: BTreeSet<&str> =
         SERVICE_DOCS.iter().map(|d| d.key).filter(|k| !k.contains('.')).collect();
     assert_eq!(documented, probe::SERVICE_KEYS.into_iter().collect());
@@ -175,7 +185,9 @@ fn defaults<C: DeserializeOwned + Serialize>(docs: &[KeyDoc], smallest: Value) {
                     continue;
                 }
                 let toml = format!("v = {text}").parse::<toml_edit::DocumentMut>().unwrap();
-                let shown: Value = toml_edit::de::from_document::<serde_json::Map<String, Value>>(toml).unwrap()["v"].clone();
+                let shown: Value = toml_edit::de::from_document::<serde_json::Map<String, Value>>(toml)
+                    .unwrap()["v"]
+                    .clone();
                 assert!(same(&shown, value), "'{}': documented {shown}, is {value}", doc.key);
             }
         }

@@ -98,14 +98,24 @@ fn owners(points: &[Point<'_>], sink: &mut Sink<'_>) {
         claims.push((from, to, percent_of(point.range), point));
         if let Some(status) = point.range.status_byte {
             // Points of one service may share their status: they get one quality.
-            let shared = claims.iter().any(|c| c.3.service == point.service && c.3.range.status_byte == Some(status) && c.0 == u64::from(status) * 8);
+            let shared = claims.iter().any(|c| {
+                c.3.service == point.service
+                    && c.3.range.status_byte == Some(status)
+                    && c.0 == u64::from(status) * 8
+            });
             if !shared {
                 let first = u64::from(status) * 8;
-                claims.push((first, first + 8, format!("{} (status)", percent(Area::Input, status, None, 1)), point));
+                claims.push((
+                    first,
+                    first + 8,
+                    format!("{} (status)", percent(Area::Input, status, None, 1)),
+                    point,
+                ));
             }
         }
     }
     claims.sort_by_key(|(from, to, _, point)| (*from, *to, point.place.start));
+    let free = claims.iter().map(|c| c.1.div_ceil(8)).max().unwrap_or(0);
     // The claim that reaches farthest so far: every overlap is one with it.
     let mut farthest = 0;
     for i in 1..claims.len() {
@@ -120,7 +130,11 @@ fn owners(points: &[Point<'_>], sink: &mut Sink<'_>) {
                 second.3.describe(sink),
                 if first.2 == second.2 { String::new() } else { format!("; the first has {}", first.2) },
             );
-            sink.error(&second.3.place, message, "give one of them another address; `dinrail map` shows what is taken");
+            sink.error(
+                &second.3.place,
+                message,
+                format!("give one of them another address; %I is free from %IB{free} on"),
+            );
         }
         if b.1 >= a.1 {
             farthest = i;
@@ -148,13 +162,23 @@ fn inside(points: &[Point<'_>], plc: &str, config: &serde_json::Value, sink: &mu
                     percent_of(point.range),
                     size.saturating_sub(1)
                 ),
-                format!("use a lower address, or set {key} = {} in service '{plc}'", end.next_multiple_of(256)),
+                format!(
+                    "use a lower address, or set {key} = {} in service '{plc}'",
+                    end.next_multiple_of(256)
+                ),
             );
         } else if point.owned && status_end > size {
             sink.error(
                 &point.place,
-                format!("status %IB{} lies beyond %I of '{plc}', which ends at %IB{}", status_end - 1, size.saturating_sub(1)),
-                format!("use a lower address, or set {key} = {} in service '{plc}'", status_end.next_multiple_of(256)),
+                format!(
+                    "status %IB{} lies beyond %I of '{plc}', which ends at %IB{}",
+                    status_end - 1,
+                    size.saturating_sub(1)
+                ),
+                format!(
+                    "use a lower address, or set {key} = {} in service '{plc}'",
+                    status_end.next_multiple_of(256)
+                ),
             );
         }
     }
@@ -199,7 +223,11 @@ fn listeners(document: &Document, stack: &Stack, sink: &mut Sink<'_>) {
                 let line = sink.source.line(first.start);
                 sink.error(
                     &place,
-                    format!("port {} is used twice: by service '{other}' (line {line}) and by service '{}'", address.port(), entry.name),
+                    format!(
+                        "port {} is used twice: by service '{other}' (line {line}) and by service '{}'",
+                        address.port(),
+                        entry.name
+                    ),
                     "give one of them another port, or another address of this machine",
                 );
             }
@@ -221,7 +249,8 @@ fn files(document: &Document, stack: &Stack, sink: &mut Sink<'_>) {
             let full = stack.dir.join(path);
             let Err(why) = readable(&full) else { continue };
             let place = document.place(&entry.name, key);
-            let at = if path.is_relative() { "; the path starts at the folder of the stack file" } else { "" };
+            let at =
+                if path.is_relative() { "; the path starts at the folder of the stack file" } else { "" };
             sink.error(
                 &place,
                 format!("key '{key}' of service '{}': {} {why}", entry.name, path.display()),
@@ -280,7 +309,10 @@ fn memory(stack: &Stack, free: u64, sink: &mut Sink<'_>) {
             readable_size(need),
             readable_size(free)
         ),
-        format!("enlarge it (mount -o remount,size=... /dev/shm) or use fewer services; largest: {}", largest.join(", ")),
+        format!(
+            "enlarge it (mount -o remount,size=... /dev/shm) or use fewer services; largest: {}",
+            largest.join(", ")
+        ),
     );
 }
 

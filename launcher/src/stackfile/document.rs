@@ -64,7 +64,11 @@ pub fn read(text: &str, kinds: &'static [Kind], sink: &mut Sink<'_>) -> Option<D
             let mut lines = error.message().lines().map(str::trim).filter(|l| !l.is_empty());
             let first = lines.next().unwrap_or("the text cannot be read");
             let rest: Vec<&str> = lines.collect();
-            let help = if rest.is_empty() { "stack files are TOML: https://toml.io".to_owned() } else { rest.join("\n") };
+            let help = if rest.is_empty() {
+                "stack files are TOML: https://toml.io".to_owned()
+            } else {
+                rest.join("\n")
+            };
             sink.error(&span, format!("no TOML: {first}"), help);
             return None;
         }
@@ -89,27 +93,29 @@ pub fn read(text: &str, kinds: &'static [Kind], sink: &mut Sink<'_>) -> Option<D
 fn read_stack(root: &Table, sink: &mut Sink<'_>) -> Option<(String, StackTable)> {
     let table = match root.get("stack") {
         Some(Item::Table(table)) => table.clone(),
-        Some(Item::Value(toml_edit::Value::InlineTable(table))) => {
-            table.clone().into_table()
-        }
+        Some(Item::Value(toml_edit::Value::InlineTable(table))) => table.clone().into_table(),
         Some(other) => {
             let span = other.span().unwrap_or_default();
-            sink.error(&span, "'stack' is no table", "write [stack] on a line of its own, then name = \"...\"");
+            sink.error(
+                &span,
+                "'stack' is no table",
+                "write [stack] on a line of its own, then name = \"...\"",
+            );
             return None;
         }
         None => {
-            sink.error(
-                &(0..0),
-                "the file has no [stack] table",
-                "begin it with\n[stack]\nname = \"...\"",
-            );
+            sink.error(&(0..0), "the file has no [stack] table", "begin it with\n[stack]\nname = \"...\"");
             return None;
         }
     };
     let header = root.key("stack").and_then(|k| k.span()).unwrap_or_default();
     let header = table.span().unwrap_or(header);
     if !table.contains_key("name") {
-        sink.error(&header, "[stack] lacks the key 'name'", "write name = \"...\"; two stacks on one machine need two names");
+        sink.error(
+            &header,
+            "[stack] lacks the key 'name'",
+            "write name = \"...\"; two stacks on one machine need two names",
+        );
         return None;
     }
     let name_span = keypath::span_of(&table, "name").unwrap_or_else(|| header.clone());
@@ -152,13 +158,21 @@ fn read_services(
         Some(other) => {
             let key = root.key("service").and_then(|k| k.span());
             let span = other.span().or(key).unwrap_or_default();
-            sink.error(&span, "'service' is no list of tables", "write [[service]] with two brackets for each service");
+            sink.error(
+                &span,
+                "'service' is no list of tables",
+                "write [[service]] with two brackets for each service",
+            );
             return Vec::new();
         }
         None => {
             if stack.is_some() {
                 let end = sink.source.text.trim_end().len();
-                sink.error(&(end..end), "the stack has no services", "add [[service]] tables, each with name and kind");
+                sink.error(
+                    &(end..end),
+                    "the stack has no services",
+                    "add [[service]] tables, each with name and kind",
+                );
             }
             return Vec::new();
         }
@@ -215,7 +229,11 @@ impl ServiceReader<'_, '_> {
         let span = item.span().unwrap_or_else(|| self.header.clone());
         let Some(text) = item.as_str() else {
             let found = item.type_name();
-            self.sink.error(&span, format!("key '{key}' of [[service]]: expected a text in quotes, found {found}"), help);
+            self.sink.error(
+                &span,
+                format!("key '{key}' of [[service]]: expected a text in quotes, found {found}"),
+                help,
+            );
             return None;
         };
         Some((text.to_owned(), span))
@@ -290,25 +308,12 @@ impl ServiceReader<'_, '_> {
             self.sink.error(&self.header, format!("{what}: {error}"), "");
             return None;
         }
-        Some(Service {
-            name,
-            kind,
-            header: self.header.clone(),
-            table: own,
-            json,
-            config,
-            launch: launch?,
-        })
+        Some(Service { name, kind, header: self.header.clone(), table: own, json, config, launch: launch? })
     }
 
     fn launch(&mut self, table: Table, what: &str, stack: Option<&StackTable>) -> Option<LaunchOptions> {
-        let scope = Scope {
-            what,
-            explain: "",
-            keys: SERVICE_DOCS,
-            more_keys: &[],
-            place: self.header.clone(),
-        };
+        let scope =
+            Scope { what, explain: "", keys: SERVICE_DOCS, more_keys: &[], place: self.header.clone() };
         let launch: LaunchTable = read_table(table.clone(), &scope, self.sink, |t| {
             toml_edit::de::from_document(DocumentMut::from(t))
         })?;

@@ -31,10 +31,12 @@ impl<'a> Node<'a> {
         match self {
             Self::Table(table) => of_table(table),
             Self::Item(Item::Table(table)) => of_table(table),
-            Self::Item(Item::Value(Value::InlineTable(table))) | Self::Value(Value::InlineTable(table)) => table
-                .iter()
-                .filter_map(|(name, value)| Some((table.key(name)?, Node::Value(value))))
-                .collect(),
+            Self::Item(Item::Value(Value::InlineTable(table))) | Self::Value(Value::InlineTable(table)) => {
+                table
+                    .iter()
+                    .filter_map(|(name, value)| Some((table.key(name)?, Node::Value(value))))
+                    .collect()
+            }
             _ => Vec::new(),
         }
     }
@@ -172,7 +174,8 @@ fn remove_in_value(value: &mut Value, span: &Range<usize>) -> bool {
 mod tests {
     use super::*;
 
-    const TEXT: &str = "a = 1\nb = { c = [10, { d = 2 }] }\n[[list]]\nx = 1\n[[list]]\nx = 2\n[list.sub]\ny = 3\n";
+    const TEXT: &str =
+        "a = 1\nb = { c = [10, { d = 2 }] }\n[[list]]\nx = 1\n[[list]]\nx = 2\n[list.sub]\ny = 3\n";
 
     #[test]
     fn paths_and_places_are_each_others_inverse() {

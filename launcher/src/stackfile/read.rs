@@ -41,7 +41,8 @@ pub fn read<T>(
         let span = error.span().filter(|s| !s.is_empty());
         // A key that is only misspelt is not missing as well.
         let names = quoted(error.message());
-        if error.message().starts_with("missing field") && names.first().is_some_and(|n| misspelt.iter().any(|m| m == n))
+        if error.message().starts_with("missing field")
+            && names.first().is_some_and(|n| misspelt.iter().any(|m| m == n))
         {
             return None;
         }
@@ -50,7 +51,7 @@ pub fn read<T>(
         }
         report(&error, &table, scope, sink);
         let unknown = error.message().starts_with("unknown field");
-        let Some(span) = span.filter(|_| unknown && tries < UNKNOWN_MAX) else { return None };
+        let span = span.filter(|_| unknown && tries < UNKNOWN_MAX)?;
         if !keypath::remove_key_at(&mut table, &span) {
             return None;
         }
@@ -117,7 +118,9 @@ fn report(error: &Error, table: &Table, scope: &Scope<'_>, sink: &mut Sink<'_>) 
 fn key_help(path: &str, scope: &Scope<'_>) -> String {
     let Some(doc) = find_key(scope.keys, path) else { return String::new() };
     let dot = if scope.explain.is_empty() { "" } else { "." };
-    format!("{}: {}\n`dinrail explain {}{dot}{}` says more", doc.key, doc.one_line(), scope.explain, doc.key)
+    // Without the marks of lists, which some shells would expand.
+    let asked = doc.key.replace("[]", "");
+    format!("{}: {}\n`dinrail explain {}{dot}{asked}` says more", doc.key, doc.one_line(), scope.explain)
 }
 
 /// The words between back-ticks of a serde message.

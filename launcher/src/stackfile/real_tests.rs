@@ -123,7 +123,7 @@ fn mistakes_in_a_stack_of_all_kinds_name_their_line() {
         text += &format!("### {title}\n{error}\n\n");
     }
     insta::with_settings!({ prepend_module_to_snapshot => false, omit_expression => true }, {
-        insta::assert_snapshot!("real_kinds", text)
+        insta::assert_snapshot!("real_kinds", text);
     });
 }
 
@@ -132,7 +132,10 @@ fn a_program_that_does_not_compile_is_shown_with_its_place() {
     let folder = Folder::new("program");
     std::fs::write(folder.0.join("main.st"), PROGRAM.replace("Shown := Speed", "Shown := Sped")).unwrap();
     let error = folder.load(STACK).unwrap_err().to_string();
-    assert!(error.contains("stack.toml:31:") && error.contains("Sped") && error.contains("main.st"), "{error}");
+    assert!(
+        error.contains("stack.toml:31:") && error.contains("Sped") && error.contains("main.st"),
+        "{error}"
+    );
 }
 
 #[test]

@@ -14,7 +14,9 @@ use ipc_types::wiring::Area;
 /// Warns once for each `[[service.map]]` table with such a register.
 pub fn check(document: &Document, stack: &Stack, sink: &mut Sink<'_>) {
     for server in stack.services.iter().filter(|s| s.kind == "modbus-server") {
-        let Ok(config) = serde_json::from_value::<dinrail_modbus::Config>(server.config.clone()) else { continue };
+        let Ok(config) = serde_json::from_value::<dinrail_modbus::Config>(server.config.clone()) else {
+            continue;
+        };
         let MapConfig::Tables(tables) = &config.map else { continue };
         let Ok(map) = config.map.build(AreaSizes::MAX, config.addressing) else { continue };
         let plc = server.wiring.plc.as_deref().and_then(|p| stack.service(p));
@@ -49,7 +51,9 @@ fn shows(entry: &MapEntry, table: Table, at: u16) -> bool {
 
 /// What the program assigns in %Q and %M, each with its place in the source.
 fn assignments(stack: &Stack, plc: &ServiceEntry) -> Vec<(artifact::Access, String)> {
-    let Ok(config) = serde_json::from_value::<dinrail_plc::Config>(plc.config.clone()) else { return Vec::new() };
+    let Ok(config) = serde_json::from_value::<dinrail_plc::Config>(plc.config.clone()) else {
+        return Vec::new();
+    };
     if config.program.is_empty() {
         return Vec::new();
     }

@@ -79,7 +79,10 @@ fn image_of(entry: &ServiceEntry, services: &[ServiceEntry]) -> Option<Result<St
         return Some(Ok(named.to_owned()));
     }
     let message = match services.iter().find(|s| s.name == named) {
-        Some(other) => format!("key '{key}' of service '{}' names '{named}', a service of kind {}", entry.name, other.kind),
+        Some(other) => format!(
+            "key '{key}' of service '{}' names '{named}', a service of kind {}",
+            entry.name, other.kind
+        ),
         None => format!("key '{key}' of service '{}' names '{named}': there is no such service", entry.name),
     };
     let list = if plcs.is_empty() { "none; add a [[service]] with kind = \"plc\"".to_owned() } else { list };
@@ -138,7 +141,11 @@ impl<'a, 's, 't> Rail<'a, 's, 't> {
             depth: decl.depth,
             max_tail: decl.max_tail,
             // Of a refusing topic the owner is the consumer.
-            writers: if decl.kind.row().when_full == WhenFull::Refuse { Vec::new() } else { vec![owner.to_owned()] },
+            writers: if decl.kind.row().when_full == WhenFull::Refuse {
+                Vec::new()
+            } else {
+                vec![owner.to_owned()]
+            },
             readers: Vec::new(),
             wakes: Vec::new(),
             max_publishers: 0,
@@ -208,7 +215,11 @@ impl<'a, 's, 't> Rail<'a, 's, 't> {
                 let message =
                     format!("service '{}' may not read '{}': only '{owner}' does", entry.name, read.topic);
                 let place = self.document.place(&entry.name, &read.key);
-                self.sink.error(&place, message, "a second reader would stop the writers; read what the owner publishes");
+                self.sink.error(
+                    &place,
+                    message,
+                    "a second reader would stop the writers; read what the owner publishes",
+                );
                 continue;
             }
             self.reader(&read.topic, &entry.name);
@@ -288,7 +299,9 @@ impl<'a, 's, 't> Rail<'a, 's, 't> {
         let fitting: Vec<&str> = self
             .topics
             .iter()
-            .filter_map(|(t, owner)| t.name.strip_prefix(owner.as_str())?.strip_prefix('/').map(|s| (s, owner)))
+            .filter_map(|(t, owner)| {
+                t.name.strip_prefix(owner.as_str())?.strip_prefix('/').map(|s| (s, owner))
+            })
             .filter(|(s, owner)| *s == suffix && **owner != entry.name)
             .map(|(_, owner)| owner.as_str())
             .collect();
@@ -298,7 +311,9 @@ impl<'a, 's, 't> Rail<'a, 's, 't> {
             format!("key '{key}' of service '{}' names '{named}'", entry.name)
         };
         let message = match self.document.service(named) {
-            Some(Service { kind, .. }) => format!("{by}, a service of kind {}, which has no topic '{topic}'", kind.name),
+            Some(Service { kind, .. }) => {
+                format!("{by}, a service of kind {}, which has no topic '{topic}'", kind.name)
+            }
             None => format!("{by}: there is no such service"),
         };
         let mut help = match nearest(named, fitting.iter().copied()) {

@@ -215,19 +215,24 @@ fn service(name: &str, kind: &str, more: &str) -> String {
 macro_rules! snapshot {
     ($name:literal, $text:expr) => {
         insta::with_settings!({ prepend_module_to_snapshot => false, omit_expression => true }, {
-            insta::assert_snapshot!($name, $text)
+            insta::assert_snapshot!($name, $text);
         })
     };
 }
 
 /// Every case's title and message, so that one file shows a whole subject.
 fn sentences(cases: &[(&str, String)]) -> String {
-    cases.iter().map(|(title, text)| format!("### {title}\n{}\n", refused(text))).collect::<Vec<_>>().join("\n")
+    cases
+        .iter()
+        .map(|(title, text)| format!("### {title}\n{}\n", refused(text)))
+        .collect::<Vec<_>>()
+        .join("\n")
 }
 
 #[test]
 fn a_right_stack_is_wired() {
-    let text = stack("plc = \"plc\"\nin = [{ byte = 0, bytes = 2 }, { byte = 2, bit = 3 }]\nout = [{ byte = 0 }]");
+    let text =
+        stack("plc = \"plc\"\nin = [{ byte = 0, bytes = 2 }, { byte = 2, bit = 3 }]\nout = [{ byte = 0 }]");
     let loaded = load_with(&text, Some(1 << 40)).unwrap();
     assert!(loaded.findings.is_empty());
     let stack = &loaded.stack;
@@ -285,7 +290,10 @@ fn keys() {
         ("two unknown keys in one table", one("cicle = \"1ms\"\nplcs = \"x\"")),
         ("unknown key in an inner table", one("in = [{ byte = 0 }, { byte = 1, symbl = \"x\" }]")),
         ("unknown key of the launcher's table", one("restart = { maxx = 3 }")),
-        ("unknown key in [stack]", stack("").replace("name = \"demo\"", "name = \"demo\"\nstop_timout = \"1s\"")),
+        (
+            "unknown key in [stack]",
+            stack("").replace("name = \"demo\"", "name = \"demo\"\nstop_timout = \"1s\""),
+        ),
         ("unknown table", format!("{}\n[[services]]\nname = \"x\"\n", stack(""))),
         ("wrong type", stack("").replace("\"can0\"\n\n", "5\n\n").replace("bus = \"can0\"", "bus = 5")),
         ("number for a rate with a unit", stack("").replace("\"500k\"", "true")),
@@ -296,7 +304,10 @@ fn keys() {
         ("unknown value", stack("").replace("bitrate = \"500k\"", "bitrate = \"500k\"\nmode = \"clasic\"")),
         ("number out of range", one("in = [{ byte = -1 }]")),
         ("not a number", one("in = [{ byte = inf }]")),
-        ("launcher values out of range", one("nice = 20\npriority = 0\nmemory_limit = \"1KiB\"\nrestart = { within = 0 }")),
+        (
+            "launcher values out of range",
+            one("nice = 20\npriority = 0\nmemory_limit = \"1KiB\"\nrestart = { within = 0 }"),
+        ),
     ];
     snapshot!("keys", sentences(&cases));
 }
@@ -309,7 +320,10 @@ fn names_and_kinds() {
         ("empty file", String::new()),
         ("no [stack]", service("can0", "can", "bitrate = \"500k\"")),
         ("no services", "[stack]\nname = \"demo\"\n".to_owned()),
-        ("[stack] without a name", "[stack]\ndescription = \"x\"\n[[service]]\nname = \"p\"\nkind = \"plc\"".to_owned()),
+        (
+            "[stack] without a name",
+            "[stack]\ndescription = \"x\"\n[[service]]\nname = \"p\"\nkind = \"plc\"".to_owned(),
+        ),
         ("[service] with one bracket", "[stack]\nname = \"demo\"\n[service]\nname = \"plc\"\n".to_owned()),
         ("service without name and kind", format!("{}[[service]]\nbitrate = \"1M\"\n", stack(""))),
         ("bad name", stack("").replace("name = \"io\"", "name = \"I O\"")),
@@ -332,7 +346,10 @@ fn neighbours() {
         ("several plc and no key", two_plcs),
         ("unknown plc", stack("plc = \"pcl\"\nout = [{ byte = 0 }]")),
         ("a plc that is none", stack("plc = \"can0\"\nin = [{ byte = 0 }]")),
-        ("no plc at all", stack("in = [{ byte = 0 }]").replace("[[service]]\nname = \"plc\"\nkind = \"plc\"\n", "")),
+        (
+            "no plc at all",
+            stack("in = [{ byte = 0 }]").replace("[[service]]\nname = \"plc\"\nkind = \"plc\"\n", ""),
+        ),
         ("a service's own finding", stack("cycle = \"1us\"")),
     ];
     snapshot!("neighbours", sentences(&cases));
@@ -342,9 +359,15 @@ fn neighbours() {
 fn conflicts() {
     let other = service("io2", "can-io", "bus = \"can0\"\nin = [{ byte = 1 }]");
     let with_other = |more: &str| format!("{}\n{other}", stack(more));
-    let bus = |more: &str| format!("{}{}", stack(""), service("can1", "can", &format!("bitrate = \"500k\"\n{more}")));
+    let bus = |more: &str| {
+        format!("{}{}", stack(""), service("can1", "can", &format!("bitrate = \"500k\"\n{more}")))
+    };
     let listening = |a: &str, b: &str| {
-        bus(&format!("listen = \"{b}\"")).replacen("bitrate = \"500k\"", &format!("bitrate = \"500k\"\nlisten = \"{a}\""), 1)
+        bus(&format!("listen = \"{b}\"")).replacen(
+            "bitrate = \"500k\"",
+            &format!("bitrate = \"500k\"\nlisten = \"{a}\""),
+            1,
+        )
     };
     let cases = [
         ("range owned twice", with_other("in = [\n  { byte = 0, bytes = 2 },\n]")),
@@ -353,10 +376,16 @@ fn conflicts() {
         ("a status in another's byte", with_other("in = [{ byte = 0, status = 1 }]")),
         ("twice in one service", stack("in = [\n  { byte = 4, bit = 1 },\n  { byte = 4, bit = 1 },\n]")),
         ("beyond %I", stack("in = [{ byte = 4095, bytes = 2 }]")),
-        ("beyond a smaller %I", stack("in = [{ byte = 16 }]").replace("kind = \"plc\"", "kind = \"plc\"\ninput_bytes = 16")),
+        (
+            "beyond a smaller %I",
+            stack("in = [{ byte = 16 }]").replace("kind = \"plc\"", "kind = \"plc\"\ninput_bytes = 16"),
+        ),
         ("status beyond %I", stack("in = [{ byte = 0, status = 5000 }]")),
         ("beyond %Q", stack("out = [{ byte = 70000 }]")),
-        ("symbol twice", stack("in = [{ byte = 0, symbol = \"Speed\" }]\nout = [{ byte = 0, symbol = \"SPEED\" }]")),
+        (
+            "symbol twice",
+            stack("in = [{ byte = 0, symbol = \"Speed\" }]\nout = [{ byte = 0, symbol = \"SPEED\" }]"),
+        ),
         ("port twice", listening("127.0.0.1:502", "127.0.0.1:502")),
         ("port of all addresses", listening("0.0.0.0:502", "127.0.0.1:502")),
         ("missing file", bus("file = \"capture.log\"")),

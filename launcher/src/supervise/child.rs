@@ -147,7 +147,7 @@ impl Child {
         let signal = match signal {
             Kill::Term => Signal::TERM,
             Kill::Abort => Signal::ABORT,
-            Kill::Kill => Signal::KILL,
+            Kill::Now => Signal::KILL,
         };
         let _ = rustix::process::pidfd_send_signal(&self.pidfd, signal);
     }
@@ -298,13 +298,14 @@ mod tests {
         assert_eq!(wait(&sh("kill -9 $$")), Exit::Signal { number: 9, core: false });
         let child = sh("read line; sleep 60");
         assert_eq!(child.reap().unwrap(), None);
-        child.signal(Kill::Kill);
+        child.signal(Kill::Now);
         assert_eq!(wait(&child).to_string(), "killed by SIGKILL");
     }
 
     #[test]
     fn usage_is_read_past_strange_names() {
-        let stat = "7 (a) b) S 1 7 7 0 -1 4194304 80 0 0 0 12 30 0 0 20 0 1 0 55 1000 200 18446744073709551615";
+        let stat =
+            "7 (a) b) S 1 7 7 0 -1 4194304 80 0 0 0 12 30 0 0 20 0 1 0 55 1000 200 18446744073709551615";
         let usage = parse_usage(stat, "Name:\ta) b\nVmHWM:\t  300 kB\nVmRSS:\t  250 kB\n").unwrap();
         assert_eq!(usage, Usage { cpu_ticks: 42, rss_bytes: 256_000 });
         assert!(super::usage(std::process::id()).unwrap().rss_bytes > 0);

@@ -2,6 +2,8 @@
 
 use super::control::{Reply, Request};
 use super::state_dir::{self, RunningStack, SOCKET};
+use ipc_types::rail::RailError;
+use ipc_types::{Context, clock};
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
 use std::time::Duration;
@@ -42,6 +44,15 @@ fn choose(mut running: Vec<RunningStack>, name: Option<&str>) -> Result<RunningS
         None if running.len() == 1 => Ok(running.swap_remove(0)),
         None => Err(ClientError::Several(names(&running))),
     }
+}
+
+/// Joins the rail of a running stack as a tool. Once a process.
+pub fn observe(stack: &RunningStack) -> Result<Context, RailError> {
+    let mut ctx = Context::observer(&stack.root)?;
+    // A tool is known by its process id, and ids come again: a later tool is a later generation, or its first
+    // messages would be taken for old ones.
+    ctx.generation = ((clock::mono_ns() / 1_000_000) as u32).max(2);
+    Ok(ctx)
 }
 
 /// A connection to a launcher.
@@ -113,7 +124,11 @@ mod tests {
         assert_eq!(choose(vec![stack("a"), stack("b")], Some("b")).unwrap().stack, "b");
         for (running, name, message) in [
             (vec![], None, "no stack is running; `dinrail up STACK.toml` or `dinrail demo` starts one"),
-            (vec![stack("a"), stack("b")], None, "several stacks are running: a, b; say which one with --stack NAME"),
+            (
+                vec![stack("a"), stack("b")],
+                None,
+                "several stacks are running: a, b; say which one with --stack NAME",
+            ),
             (vec![stack("a")], Some("x"), "no stack 'x' is running; running: a"),
         ] {
             assert_eq!(choose(running, name).unwrap_err().to_string(), message);

@@ -88,19 +88,32 @@ pub enum Reply {
     Ps(Vec<ServiceRow>),
     Status(StackStatus),
     Log(LogLine),
-    Restarted { service: String, generation: u32, after_ms: u64 },
-    Stopping { pid: u32 },
+    Restarted {
+        service: String,
+        generation: u32,
+        after_ms: u64,
+    },
+    Stopping {
+        pid: u32,
+    },
     /// Nothing more comes.
     End,
     Error(String),
+}
+
+/// Which new log lines a client wants.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Follows {
+    None,
+    One(usize),
+    All,
 }
 
 struct Client {
     stream: UnixStream,
     input: Vec<u8>,
     output: Vec<u8>,
-    /// Wants new log lines of this service, `None` = of all.
-    follows: Option<Option<usize>>,
+    follows: Follows,
 }
 
 /// What came of reading a client.
@@ -144,8 +157,10 @@ impl ControlServer {
                 continue;
             }
             self.next += 1;
-            self.clients
-                .insert(self.next, Client { stream, input: Vec::new(), output: Vec::new(), follows: None });
+            self.clients.insert(
+                self.next,
+                Client { stream, input: Vec::new(), output: Vec::new(), follows: Follows::None },
+            );
             new.push(self.next);
         }
         new
@@ -190,7 +205,7 @@ impl ControlServer {
 
     pub fn follow(&mut self, id: u64, service: Option<usize>) {
         if let Some(client) = self.clients.get_mut(&id) {
-            client.follows = Some(service);
+            client.follows = service.map_or(Follows::All, Follows::One);
         }
     }
 
@@ -199,14 +214,11 @@ impl ControlServer {
         let ids: Vec<u64> = self
             .clients
             .iter()
-            .filter(|(_, c)| c.follows.is_some_and(|f| f.is_none_or(|s| s == line.service)))
+            .filter(|(_, c)| c.follows == Follows::All || c.follows == Follows::One(line.service))
             .map(|(id, _)| *id)
             .collect();
-        let reply = Reply::Log(LogLine {
-            utc_ns: line.utc_ns,
-            service: name.to_owned(),
-            line: line.text.clone(),
-        });
+        let reply =
+            Reply::Log(LogLine { utc_ns: line.utc_ns, service: name.to_owned(), line: line.text.clone() });
         ids.into_iter().filter(|id| !self.answer(*id, &reply)).collect()
     }
 

@@ -22,7 +22,9 @@ pub enum GroundError {
     Foreign(PathBuf),
     #[error("another launcher answers in {0}: stop it first (`dinrail down`)")]
     Answers(PathBuf),
-    #[error("process {0} of an earlier run of this stack does not end, even after SIGKILL: see `ps -o stat,wchan {0}`")]
+    #[error(
+        "process {0} of an earlier run of this stack does not end, even after SIGKILL: see `ps -o stat,wchan {0}`"
+    )]
     Leftover(u32),
     #[error("shared memory {path}: {source}; is /dev/shm mounted, writable and not full?")]
     Folder { path: PathBuf, source: io::Error },
@@ -86,7 +88,8 @@ fn end_leftovers(root: &Path) -> Result<(), GroundError> {
         if words.get(1) != Some(&b"__service".as_slice()) || !words.contains(&root) {
             continue;
         }
-        let Some(pidfd) = Pid::from_raw(pid).and_then(|p| rustix::process::pidfd_open(p, PidfdFlags::empty()).ok())
+        let Some(pidfd) =
+            Pid::from_raw(pid).and_then(|p| rustix::process::pidfd_open(p, PidfdFlags::empty()).ok())
         else {
             continue;
         };
@@ -111,7 +114,10 @@ fn alive(pid: i32) -> bool {
 /// Allows as many descriptors as the system lets us: about 15 a topic and process.
 pub fn raise_descriptor_limit() {
     let limit = rustix::process::getrlimit(Resource::Nofile);
-    let _ = rustix::process::setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, maximum: limit.maximum });
+    let _ = rustix::process::setrlimit(
+        Resource::Nofile,
+        Rlimit { current: limit.maximum, maximum: limit.maximum },
+    );
 }
 
 /// Opens a listener of a service.
@@ -207,7 +213,10 @@ mod tests {
         let address = held.local_addr().unwrap();
         let listener = Listener { name: "modbus".into(), address, key: "tcp.port".into() };
         let message = listen("modbus", &listener).unwrap_err().to_string();
-        let start = format!("service 'modbus', tcp.port: cannot listen on {address}: port {} is in use", address.port());
+        let start = format!(
+            "service 'modbus', tcp.port: cannot listen on {address}: port {} is in use",
+            address.port()
+        );
         assert!(message.starts_with(&start), "{message}");
         assert!(message.contains(&format!("pid {}", std::process::id())), "{message}");
     }

@@ -14,7 +14,10 @@ impl Watchdog {
     /// Opens, and so arms, the device.
     pub fn open(path: &Path) -> io::Result<Self> {
         let file = OpenOptions::new().write(true).open(path).map_err(|e| {
-            io::Error::new(e.kind(), format!("{}: {e}; is a driver loaded (softdog), and may you write to it?", path.display()))
+            io::Error::new(
+                e.kind(),
+                format!("{}: {e}; is a driver loaded (softdog), and may you write to it?", path.display()),
+            )
         })?;
         Ok(Self { file })
     }

@@ -46,11 +46,6 @@ impl Logbook {
         Self { rings: vec![VecDeque::new(); services], partial: vec![Vec::new(); services], next: 1 }
     }
 
-    /// Number that the next line gets.
-    pub fn next_number(&self) -> u64 {
-        self.next
-    }
-
     /// Adds a whole line of the launcher's own, e.g. that a service was restarted.
     pub fn note(&mut self, service: usize, text: &str, utc_ns: i64) -> Line {
         let text = clean(text.as_bytes());

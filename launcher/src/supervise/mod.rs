@@ -113,6 +113,7 @@ fn system(what: &'static str) -> impl Fn(io::Error) -> UpError {
 /// other thread exists.
 pub fn run(loaded: Loaded, options: &Options) -> Result<Outcome, UpError> {
     let Loaded { stack, launch, settings, .. } = loaded;
+    sys::keep_descriptors_private();
     let executable = Executable::own().map_err(system("opening its own executable"))?;
     let stop_signals = supervisor::stop_signals();
     let signal_fd = signals::descriptor(&stop_signals).map_err(system("signals"))?;
@@ -147,7 +148,17 @@ pub fn run(loaded: Loaded, options: &Options) -> Result<Outcome, UpError> {
         Ok(other) => return Err(UpError::Rail(format!("unexpected {other:?}"))),
         Err(_) => return Err(UpError::Rail(format!("no answer within {} s", RAIL_START_LIMIT.as_secs()))),
     }
-    let parts = supervisor::Parts { stack, launch, settings, executable, signal_fd, listeners, retain, rail, hardware };
+    let parts = supervisor::Parts {
+        stack,
+        launch,
+        settings,
+        executable,
+        signal_fd,
+        listeners,
+        retain,
+        rail,
+        hardware,
+    };
     let outcome = Supervisor::new(parts, options).map_err(system("setting up supervision"))?.run();
     drop(wipe);
     outcome.map_err(system("waiting for events"))

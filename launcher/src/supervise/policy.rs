@@ -12,6 +12,10 @@
 //! Stopping -> Ended                                  in reverse order, recorders last
 //! ```
 
+mod model;
+
+pub use model::{Action, Death, Exhausted, Kill, Notice, Phase, Rule, Slot};
+
 use ipc_types::event::{EventKind, Level};
 use ipc_types::payload::HealthState;
 use serde_json::{Value, json};
@@ -19,180 +23,11 @@ use std::collections::VecDeque;
 
 /// Between SIGABRT, which leaves a core and a backtrace, and SIGKILL.
 pub const ABORT_GRACE_NS: u64 = 500_000_000;
-/// Between SIGTERM and SIGKILL, unless the stack says otherwise.
-pub const TERM_GRACE_NS: u64 = 2_000_000_000;
 /// So many clean-ups of dead nodes may fail in a row before the stack fails.
 pub const CLEAN_ATTEMPTS: u32 = 3;
-
-/// What happens when the restart budget is used up.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Exhausted {
-    /// The service stays down, its inherited listeners are closed; the others go on.
-    #[default]
-    Hold,
-    /// The whole stack stops with exit code 1.
-    FailStack,
-}
-
-/// How one service is supervised.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Rule {
-    /// So many restarts...
-    pub max: u32,
-    /// ... within this time; a run that was ready for so long counts as healthy and resets the budget.
-    pub within_ns: u64,
-    /// Delay of the second restart in a row; doubles up to `backoff_max_ns`. The first one has no delay.
-    pub backoff_first_ns: u64,
-    pub backoff_max_ns: u64,
-    pub on_exhausted: Exhausted,
-    /// Silence after which a service that was ready counts as hanging.
-    pub hang_timeout_ns: u64,
-    /// A service that has not reported ready so long after its start counts as hanging: longer, because
-    /// compiling a large program comes before.
-    pub start_timeout_ns: u64,
-    /// Started first and stopped last, so that a recording holds everything.
-    pub recorder: bool,
-}
-
-impl Default for Rule {
-    fn default() -> Self {
-        Self {
-            max: 5,
-            within_ns: 10_000_000_000,
-            backoff_first_ns: 50_000_000,
-            backoff_max_ns: 5_000_000_000,
-            on_exhausted: Exhausted::Hold,
-            hang_timeout_ns: 2_000_000_000,
-            start_timeout_ns: 10_000_000_000,
-            recorder: false,
-        }
-    }
-}
-
-/// Signals that supervision sends.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kill {
-    Term,
-    Abort,
-    Kill,
-}
-
-/// Something that happened, for the rail, the recording and the log.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Notice {
-    /// Index of the service it is about; `None` = the stack.
-    pub service: Option<usize>,
-    pub kind: EventKind,
-    pub level: Level,
-    pub message: String,
-    pub detail: Value,
-}
-
-/// What the caller has to do, in order.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Action {
-    /// Start the process; report with [`Policy::started`] or [`Policy::died`].
-    Spawn { service: usize, generation: u32 },
-    Signal { service: usize, signal: Kill },
-    /// Run the helper that cleans dead nodes; report with [`Policy::clean_done`].
-    Clean,
-    /// Close the listeners that the service would inherit, so that clients are refused, not kept waiting.
-    CloseListeners { service: usize },
-    Tell(Notice),
-    /// Every process has ended.
-    Ended,
-}
-
-/// How a process ended.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Death {
-    /// `killed by SIGKILL`, `exit code 1`.
-    pub how: String,
-    /// Signal, exit code, last log lines.
-    pub detail: Value,
-}
-
-/// Where a service is in its life.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Phase {
-    Idle,
-    Starting,
-    Running,
-    /// SIGABRT was sent because it hangs.
-    Aborting {
-        kill_at: u64,
-    },
-    /// SIGKILL was sent because it hangs.
-    Killed,
-    /// SIGTERM was sent by `restart`.
-    Restarting {
-        kill_at: u64,
-    },
-    /// Dead; the clean-up number `round` comes before the restart.
-    Cleaning {
-        round: u64,
-        planned: bool,
-    },
-    /// Dead; started again at this time.
-    Waiting {
-        until: u64,
-    },
-    Held,
-    /// SIGTERM was sent by the end of the stack.
-    Stopping {
-        kill_at: u64,
-    },
-    Ended,
-}
-
-impl Phase {
-    /// A process exists.
-    pub fn alive(self) -> bool {
-        matches!(
-            self,
-            Self::Starting
-                | Self::Running
-                | Self::Aborting { .. }
-                | Self::Killed
-                | Self::Restarting { .. }
-                | Self::Stopping { .. }
-        )
-    }
-
-    /// Word in `ps`.
-    pub fn word(self) -> &'static str {
-        match self {
-            Self::Idle => "idle",
-            Self::Starting => "starting",
-            Self::Running => "running",
-            Self::Aborting { .. } | Self::Killed => "hung",
-            Self::Restarting { .. } | Self::Cleaning { .. } => "restarting",
-            Self::Waiting { .. } => "back-off",
-            Self::Held => "held",
-            Self::Stopping { .. } => "stopping",
-            Self::Ended => "ended",
-        }
-    }
-}
-
-/// A supervised service.
-#[derive(Debug, Clone)]
-pub struct Slot {
-    pub name: String,
-    pub rule: Rule,
-    pub phase: Phase,
-    /// 1 at the first start.
-    pub generation: u32,
-    /// When the present process was started.
-    pub since: u64,
-    /// When the present process reported ready; 0 = not yet.
-    pub ready_at: u64,
-    last_sign: u64,
-    /// Times of unplanned restarts within the budget's window.
-    recent: VecDeque<u64>,
-    /// Failures since the last healthy run.
-    row: u32,
-}
+/// How long the other services wait for the recorders at the start of a stack. A recorder is ready after some
+/// 20 ms; one that is not must not keep a plant from running.
+pub const RECORDER_HEAD_START_NS: u64 = 500_000_000;
 
 /// The supervision of one stack.
 #[derive(Debug)]
@@ -261,10 +96,29 @@ impl Policy {
         std::mem::take(&mut self.out)
     }
 
-    /// Starts every service, recorders first, then in the order of the stack file.
+    /// Starts every service in the order of the stack file, recorders first: the others wait until these are
+    /// ready, so that the first scan and its keyframe are in the recording, but not for ever.
     pub fn start(&mut self, now: u64) {
+        let recorded = self.slots.iter().any(|slot| slot.rule.recorder);
         for service in self.order.clone() {
-            self.spawn(service, now);
+            if recorded && !self.slots[service].rule.recorder {
+                self.slots[service].phase = Phase::Waiting { until: now + RECORDER_HEAD_START_NS };
+            } else {
+                self.spawn(service, now);
+            }
+        }
+    }
+
+    /// Starts what still waits for the recorders' first start, once none of these is on its way any more.
+    fn recorders_are_up(&mut self, now: u64) {
+        if self.stopping || self.slots.iter().any(|s| s.rule.recorder && s.phase == Phase::Starting) {
+            return;
+        }
+        for service in self.order.clone() {
+            let slot = &self.slots[service];
+            if slot.generation == 0 && matches!(slot.phase, Phase::Waiting { .. }) {
+                self.spawn(service, now);
+            }
         }
     }
 
@@ -320,6 +174,7 @@ impl Policy {
                 format!("ready after {after_ms} ms"),
                 json!({ "generation": generation, "after_ms": after_ms }),
             );
+            self.recorders_are_up(now);
         }
     }
 
@@ -477,8 +332,11 @@ impl Policy {
         let count = slot.recent.len();
         let delay_ms = delay / 1_000_000;
         let when = if delay == 0 { "at once".to_owned() } else { format!("in {delay_ms} ms") };
-        let message =
-            format!("starting again {when} ({count} of {} restarts in {} s)", rule.max, rule.within_ns / 1_000_000_000);
+        let message = format!(
+            "starting again {when} ({count} of {} restarts in {} s)",
+            rule.max,
+            rule.within_ns / 1_000_000_000
+        );
         slot.phase = Phase::Waiting { until: now + delay };
         let next = slot.generation + 1;
         self.tell(
@@ -546,17 +404,20 @@ impl Policy {
             match self.slots[service].phase {
                 Phase::Aborting { kill_at } if now >= kill_at => {
                     self.slots[service].phase = Phase::Killed;
-                    self.out.push(Action::Signal { service, signal: Kill::Kill });
+                    self.out.push(Action::Signal { service, signal: Kill::Now });
                 }
                 Phase::Restarting { kill_at } if now >= kill_at => {
                     self.slots[service].phase = Phase::Restarting { kill_at: u64::MAX };
-                    self.out.push(Action::Signal { service, signal: Kill::Kill });
+                    self.out.push(Action::Signal { service, signal: Kill::Now });
                 }
                 Phase::Stopping { kill_at } if now >= kill_at => {
                     self.slots[service].phase = Phase::Stopping { kill_at: u64::MAX };
-                    let message = format!("did not end within {} ms of SIGTERM: killed", self.term_grace_ns / 1_000_000);
+                    let message = format!(
+                        "did not end within {} ms of SIGTERM: killed",
+                        self.term_grace_ns / 1_000_000
+                    );
                     self.tell(Some(service), EventKind::Hung, Level::Warning, message, Value::Null);
-                    self.out.push(Action::Signal { service, signal: Kill::Kill });
+                    self.out.push(Action::Signal { service, signal: Kill::Now });
                 }
                 Phase::Waiting { until } if now >= until && !self.stopping => self.spawn(service, now),
                 _ => {}
@@ -582,7 +443,7 @@ impl Policy {
             for service in 0..self.slots.len() {
                 if self.slots[service].phase.alive() {
                     self.slots[service].phase = Phase::Stopping { kill_at: u64::MAX };
-                    self.out.push(Action::Signal { service, signal: Kill::Kill });
+                    self.out.push(Action::Signal { service, signal: Kill::Now });
                 }
             }
             return;

@@ -7,6 +7,7 @@ use proptest::prelude::*;
 
 const MS: u64 = 1_000_000;
 const S: u64 = 1_000_000_000;
+const TERM_GRACE_NS: u64 = 2 * S;
 
 fn policy(rules: Vec<Rule>) -> Policy {
     let names = ["can0", "plc", "rec", "modbus"];
@@ -33,7 +34,8 @@ fn told(policy: &mut Policy) -> Vec<EventKind> {
 fn running(rules: Vec<Rule>) -> Policy {
     let mut p = policy(rules);
     p.start(0);
-    for i in 0..p.slots().len() {
+    // Twice: the recorders come first.
+    for i in (0..p.slots().len()).chain(0..p.slots().len()) {
         p.beat(i, 1, HealthState::Ready, 10 * MS);
     }
     p.take();
@@ -44,15 +46,17 @@ fn running(rules: Vec<Rule>) -> Policy {
 fn recorders_start_first_and_stop_last() {
     let rec = Rule { recorder: true, ..Rule::default() };
     let mut p = policy(vec![Rule::default(), Rule::default(), rec, Rule::default()]);
+    let spawned = |p: &mut Policy| -> Vec<usize> {
+        let service = |a: &Action| match a {
+            Action::Spawn { service, generation: 1 } => Some(*service),
+            _ => None,
+        };
+        done(p).iter().filter_map(service).collect()
+    };
     p.start(0);
-    let order: Vec<usize> = done(&mut p)
-        .iter()
-        .map(|a| match a {
-            Action::Spawn { service, generation: 1 } => *service,
-            other => panic!("{other:?}"),
-        })
-        .collect();
-    assert_eq!(order, [2, 0, 1, 3]);
+    assert_eq!(spawned(&mut p), [2]);
+    p.beat(2, 1, HealthState::Ready, 20 * MS);
+    assert_eq!(spawned(&mut p), [0, 1, 3]);
     p.stop("asked", S);
     for service in [3, 1, 0, 2] {
         assert_eq!(done(&mut p), [Action::Signal { service, signal: Kill::Term }]);
@@ -60,6 +64,17 @@ fn recorders_start_first_and_stop_last() {
     }
     assert_eq!(done(&mut p), [Action::Ended]);
     assert!(p.ended() && p.failed().is_none());
+}
+
+#[test]
+fn a_recorder_that_does_not_get_ready_keeps_nobody_waiting_for_ever() {
+    let rec = Rule { recorder: true, ..Rule::default() };
+    let mut p = policy(vec![rec, Rule::default()]);
+    p.start(0);
+    assert_eq!(done(&mut p).len(), 1);
+    assert_eq!(p.next_deadline(), Some(RECORDER_HEAD_START_NS));
+    p.tick(RECORDER_HEAD_START_NS);
+    assert_eq!(done(&mut p), [Action::Spawn { service: 1, generation: 1 }]);
 }
 
 #[test]
@@ -142,7 +157,7 @@ fn silence_is_a_hang_then_sigabrt_then_sigkill() {
     p.heartbeats_read(S + 20 * MS);
     assert!(p.take().is_empty(), "once");
     p.tick(S + 511 * MS);
-    assert_eq!(done(&mut p), [Action::Signal { service: 0, signal: Kill::Kill }]);
+    assert_eq!(done(&mut p), [Action::Signal { service: 0, signal: Kill::Now }]);
     p.died(0, death(), S + 512 * MS);
     p.clean_done(Ok(()), S + 520 * MS);
     assert_eq!(done(&mut p), [Action::Clean, Action::Spawn { service: 0, generation: 2 }]);
@@ -211,10 +226,7 @@ fn restart_by_command_costs_no_budget_and_is_no_fault() {
     p.tick(S + TERM_GRACE_NS);
     assert_eq!(
         done(&mut p),
-        [
-            Action::Signal { service: 0, signal: Kill::Term },
-            Action::Signal { service: 0, signal: Kill::Kill }
-        ]
+        [Action::Signal { service: 0, signal: Kill::Term }, Action::Signal { service: 0, signal: Kill::Now }]
     );
     p.died(0, death(), S);
     p.clean_done(Ok(()), S);
@@ -230,18 +242,12 @@ fn who_ignores_sigterm_at_the_end_is_killed_and_a_second_stop_kills_all() {
     p.tick(S + TERM_GRACE_NS);
     assert_eq!(
         done(&mut p),
-        [
-            Action::Signal { service: 1, signal: Kill::Term },
-            Action::Signal { service: 1, signal: Kill::Kill }
-        ]
+        [Action::Signal { service: 1, signal: Kill::Term }, Action::Signal { service: 1, signal: Kill::Now }]
     );
     p.stop("asked", S);
     assert_eq!(
         done(&mut p),
-        [
-            Action::Signal { service: 0, signal: Kill::Kill },
-            Action::Signal { service: 1, signal: Kill::Kill }
-        ]
+        [Action::Signal { service: 0, signal: Kill::Now }, Action::Signal { service: 1, signal: Kill::Now }]
     );
     p.died(0, death(), S);
     p.died(1, death(), S);

@@ -9,8 +9,12 @@ use std::time::Duration;
 
 /// Services, where they listen, what is recorded where.
 pub fn banner(stack: &Stack, pid: u32) -> String {
-    let mut text =
-        format!("stack '{}' from {}, launcher pid {pid}, {}", stack.name, stack.file.display(), stack.root.display());
+    let mut text = format!(
+        "stack '{}' from {}, launcher pid {pid}, {}",
+        stack.name,
+        stack.file.display(),
+        stack.root.display()
+    );
     for service in &stack.services {
         text += &format!("\n  {:<12} {:<14}", service.name, service.kind);
         for listener in &service.wiring.listeners {
@@ -49,11 +53,6 @@ pub struct Progress {
 impl Progress {
     pub fn new(json: bool) -> Self {
         Self { last: Observed::default(), json }
-    }
-
-    /// The last picture.
-    pub fn last(&self) -> &Observed {
-        &self.last
     }
 
     /// One line about the time since the last one.

@@ -1,8 +1,8 @@
 //! The other side of the launcher's spawn: what a child process does before and after its service's `run`.
 
 use super::child::Executable;
-use super::inject;
 use super::debris;
+use super::inject;
 use super::sys;
 use crate::kinds;
 use ipc_types::reactor::signals;

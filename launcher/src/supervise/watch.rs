@@ -126,7 +126,8 @@ impl Observer {
             plc.image.newest(|image, tail| {
                 plc.state = image.plc_state();
                 plc.scans = image.scan;
-                plc.values = plc.points.iter().filter_map(|p| Some((label(p), value(image, tail, p)?))).collect();
+                plc.values =
+                    plc.points.iter().filter_map(|p| Some((label(p), value(image, tail, p)?))).collect();
             });
         }
         for recorder in &mut self.recorders {

@@ -1,7 +1,7 @@
 //! The service's table of the stack file.
 
 use ipc_types::units::Span;
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, de};
 
 use crate::address::Addressing;
 use crate::protocol::signal::ByteOrder;
@@ -84,7 +84,7 @@ impl<'de> Deserialize<'de> for Id {
                     !digits.is_empty() && digits.len() <= 8 && digits.bytes().all(|c| c.is_ascii_hexdigit());
                 let value = hex.then(|| u32::from_str_radix(digits, 16).ok()).flatten();
                 let value = value.ok_or_else(|| {
-                    serde::de::Error::custom(format!("identifier '{text}' must be 1 to 8 hex digits"))
+                    de::Error::custom(format!("identifier '{text}' must be 1 to 8 hex digits"))
                 })?;
                 Ok(Self { value, extended: digits.len() == 8 || value > 0x7FF })
             }
@@ -245,13 +245,35 @@ pub struct OutputSignal {
 }
 
 /// Safe state of a frame: `"silent"`, `"hold"`, `"not_available"` or `{ values = [...] }`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged, expecting = "\"silent\", \"hold\", \"not_available\" or { values = [...] }")]
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(untagged)]
 pub enum OnStop {
     /// One of the words.
     Word(OnStopWord),
     /// Values of the signals, in their order and unit.
     Values(StopValues),
+}
+
+impl<'de> Deserialize<'de> for OnStop {
+    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
+        struct Visit;
+        impl<'de> de::Visitor<'de> for Visit {
+            type Value = OnStop;
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("\"silent\", \"hold\", \"not_available\" or { values = [...] }")
+            }
+            fn visit_str<E: de::Error>(self, text: &str) -> Result<OnStop, E> {
+                OnStopWord::deserialize(de::value::StrDeserializer::<E>::new(text))
+                    .map(OnStop::Word)
+                    .map_err(|_| E::invalid_value(de::Unexpected::Str(text), &self))
+            }
+            // A derived untagged enum would swallow which key of the table is unknown.
+            fn visit_map<A: de::MapAccess<'de>>(self, map: A) -> Result<OnStop, A::Error> {
+                StopValues::deserialize(de::value::MapAccessDeserializer::new(map)).map(OnStop::Values)
+            }
+        }
+        d.deserialize_any(Visit)
+    }
 }
 
 /// The table form of [`OnStop`].
@@ -342,6 +364,18 @@ mod tests {
         // The resolved stack holds the table as JSON: reading it again must give the same.
         let again: Config = serde_json::from_value(serde_json::to_value(&config).unwrap()).unwrap();
         assert_eq!(again, config);
+    }
+
+    #[test]
+    fn a_bad_safe_state_is_named() {
+        let said = |value| serde_json::from_value::<OnStop>(value).unwrap_err().to_string();
+        let all = [said(json!("off")), said(json!(0)), said(json!({ "valeus": [1] })), said(json!({}))];
+        insta::assert_snapshot!(all.join("\n"), @r#"
+        invalid value: string "off", expected "silent", "hold", "not_available" or { values = [...] }
+        invalid type: integer `0`, expected "silent", "hold", "not_available" or { values = [...] }
+        unknown field `valeus`, expected `values`
+        missing field `values`
+        "#);
     }
 
     #[test]

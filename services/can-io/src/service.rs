@@ -252,6 +252,8 @@ struct Service {
     published_ns: u64,
     image_ns: u64,
     safe: Option<Unsafe>,
+    /// The last `safe_entered` has no `safe_left` yet.
+    safe_told: bool,
     event_budget: u32,
     events_left_out: u32,
 }
@@ -291,6 +293,7 @@ pub fn run(mut ctx: Context) -> Result<(), RunError> {
         published_ns: 0,
         image_ns: 0,
         safe: Some(Unsafe::Waiting),
+        safe_told: false,
         event_budget: QUALITY_EVENTS,
         events_left_out: 0,
     };
@@ -422,7 +425,9 @@ impl Service {
             image_ns = image.stamp.t_ns;
             let why = judge(image.plc_state(), image.scan, safe_on);
             let fresh = clock::mono_ns().saturating_sub(image_ns) <= self.config.stale_after.ns();
-            if why.is_none() && fresh {
+            // One that waited too long in the queue is as good as none.
+            let why = why.or((!fresh).then_some(Unsafe::Stale));
+            if why.is_none() {
                 outputs.image(q, m, clock::mono_ns());
             }
             verdict = Some(why);
@@ -444,7 +449,7 @@ impl Service {
         if self.safe == why {
             return;
         }
-        let before = std::mem::replace(&mut self.safe, why);
+        self.safe = why;
         if self.image.is_none() {
             return;
         }
@@ -453,6 +458,7 @@ impl Service {
                 let was_running = self.outputs.is_running();
                 self.outputs.safe(clock::mono_ns());
                 if was_running {
+                    self.safe_told = true;
                     let message = format!("outputs went to their safe state: {}", why.text());
                     self.ctx.event(
                         EventKind::SafeEntered,
@@ -462,7 +468,8 @@ impl Service {
                     );
                 }
             }
-            None if before != Some(Unsafe::Waiting) => {
+            None if self.safe_told => {
+                self.safe_told = false;
                 let message = "outputs follow the image again";
                 self.ctx.event(EventKind::SafeLeft, Level::Info, message, serde_json::Value::Null);
             }

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use ipc_types::Finding;
 use ipc_types::net::IpFilter;
 use ipc_types::units::{BitRate, Size, Span};
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, de};
 
 use crate::feed;
 use crate::virtual_bus::{CLIENT_QUEUE, MAX_CLIENTS, Settings};
@@ -76,16 +76,36 @@ pub struct Serve {
 }
 
 /// Where a server listens: `"127.0.0.1:29536"` or a table with filter and limit.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(
-    untagged,
-    expecting = "an address such as \"127.0.0.1:29536\", or a table { address, filter, max_clients }"
-)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(untagged)]
 pub enum Endpoint {
     /// The address alone.
     Address(SocketAddr),
     /// Address, filter and limit.
     Table(EndpointTable),
+}
+
+impl<'de> Deserialize<'de> for Endpoint {
+    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
+        struct Visit;
+        impl<'de> de::Visitor<'de> for Visit {
+            type Value = Endpoint;
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str(
+                    "an address such as \"127.0.0.1:29536\", or a table { address, filter, max_clients }",
+                )
+            }
+            fn visit_str<E: de::Error>(self, text: &str) -> Result<Endpoint, E> {
+                let address = text.parse().map_err(|_| E::invalid_value(de::Unexpected::Str(text), &self))?;
+                Ok(Endpoint::Address(address))
+            }
+            // A derived untagged enum would swallow which key of the table is unknown.
+            fn visit_map<A: de::MapAccess<'de>>(self, map: A) -> Result<Endpoint, A::Error> {
+                EndpointTable::deserialize(de::value::MapAccessDeserializer::new(map)).map(Endpoint::Table)
+            }
+        }
+        d.deserialize_any(Visit)
+    }
 }
 
 /// The long form of [`Endpoint`].
@@ -339,6 +359,25 @@ mod tests {
         ] {
             assert!(serde_json::from_value::<Config>(value.clone()).is_err(), "{value}");
         }
+    }
+
+    #[test]
+    fn a_bad_server_is_named() {
+        let said = |value| serde_json::from_value::<Endpoint>(value).unwrap_err().to_string();
+        let all = [
+            said(json!("localhost:29536")),
+            said(json!("127.0.0.1")),
+            said(json!(29536)),
+            said(json!({ "address": "127.0.0.1:1", "fliter": {} })),
+            said(json!({ "filter": { "mask": "1", "start": "10.0.0.1", "end": "10.0.0.2" } })),
+        ];
+        insta::assert_snapshot!(all.join("\n"), @r#"
+        invalid value: string "localhost:29536", expected an address such as "127.0.0.1:29536", or a table { address, filter, max_clients }
+        invalid value: string "127.0.0.1", expected an address such as "127.0.0.1:29536", or a table { address, filter, max_clients }
+        invalid type: integer `29536`, expected an address such as "127.0.0.1:29536", or a table { address, filter, max_clients }
+        unknown field `fliter`, expected one of `address`, `filter`, `max_clients`
+        invalid IPv4 address syntax
+        "#);
     }
 
     #[test]

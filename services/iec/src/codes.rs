@@ -38,7 +38,7 @@ codes! {
 "E0101" "character that does not belong here"
     cause "A character or an unclosed text that is no part of the language."
     remedy "Remove it; close texts on their line; write names in ASCII."
-    bad "PROGRAM p VAR x : INT; END_VAR x := 1 ! 2; END_PROGRAM"
+    bad "PROGRAM p VAR x : INT; END_VAR x := 1 + 2 !; END_PROGRAM"
     good "PROGRAM p VAR x : INT; END_VAR x := 1 + 2; END_PROGRAM";
 "E0102" "comment is never closed"
     cause "`(*` or `/*` without its end. Comments nest, so every inner one needs its own end."

@@ -7,15 +7,15 @@
 //! What may never happen here: a scan that depends on anything its record does not hold, an output before the
 //! first finished scan, a program that takes the process down.
 
+pub mod config;
 pub mod engine;
+pub mod program;
 pub mod retain;
 pub mod routes;
-pub mod setup;
-pub mod config;
-pub mod program;
 pub mod service;
+pub mod setup;
 
 pub use config::Config;
 pub use service::{KIND, RunError, check, run, topics};
-pub mod verify;
 pub mod trace;
+pub mod verify;

@@ -59,8 +59,7 @@ pub fn load(dir: &Path, files: &[PathBuf], setup: &Setup) -> Result<Compiled, Pr
 pub fn compile_sources(sources: Vec<Source>, setup: &Setup) -> Result<Compiled, ProgramError> {
     match compile(&sources, &setup.options()) {
         Ok(compiled) => {
-            let warnings =
-                (!compiled.warnings.is_empty()).then(|| compiled.render_warnings(&sources, false));
+            let warnings = (!compiled.warnings.is_empty()).then(|| compiled.render_warnings(&sources, false));
             Ok(Compiled { program: Arc::new(Program { artifact: compiled.artifact, sources }), warnings })
         }
         Err(diagnostics) => Err(ProgramError::Compile(diagnostics.render(false))),
@@ -121,7 +120,9 @@ pub fn external(range: &ImageRange, owner: &str, addressing: Addressing) -> Resu
         (None, None, 2) => "UINT".to_owned(),
         (None, None, 4) => "UDINT".to_owned(),
         (None, None, 8) => "ULINT".to_owned(),
-        (None, None, n) => return Err(format!("{n} bytes are no elementary type, a symbol needs 1, 2, 4 or 8")),
+        (None, None, n) => {
+            return Err(format!("{n} bytes are no elementary type, a symbol needs 1, 2, 4 or 8"));
+        }
     };
     let address = address_text(range, addressing)?;
     let origin = format!("service '{owner}' {}", range.key);

@@ -56,7 +56,9 @@ pub enum RouteError {
     Address(String),
     #[error("'{0}' lies in %I, which belongs to the field services; a route writes %Q or %M")]
     IntoInput(String),
-    #[error("'{0}' is no type of a route; write one of BOOL, BYTE, WORD, DWORD, LWORD, SINT, INT, DINT, LINT, USINT, UINT, UDINT, ULINT, REAL, LREAL")]
+    #[error(
+        "'{0}' is no type of a route; write one of BOOL, BYTE, WORD, DWORD, LWORD, SINT, INT, DINT, LINT, USINT, UINT, UDINT, ULINT, REAL, LREAL"
+    )]
     Type(String),
     #[error("'{address}' has {has} bytes, {type_name} needs {needs}")]
     Size { address: String, has: u32, type_name: &'static str, needs: u32 },
@@ -107,11 +109,9 @@ pub struct RoutePlan<'a> {
 /// The type of this name; TIME and STRING cannot be routed.
 pub fn elem_type(name: &str) -> Option<ElemType> {
     use ElemType::*;
-    [
-        Bool, Byte, Word, Dword, Lword, Sint, Int, Dint, Lint, Usint, Uint, Udint, Ulint, Real, Lreal,
-    ]
-    .into_iter()
-    .find(|t| t.name().eq_ignore_ascii_case(name))
+    [Bool, Byte, Word, Dword, Lword, Sint, Int, Dint, Lint, Usint, Uint, Udint, Ulint, Real, Lreal]
+        .into_iter()
+        .find(|t| t.name().eq_ignore_ascii_case(name))
 }
 
 fn default_type(size: AddressSize) -> ElemType {
@@ -127,7 +127,8 @@ fn default_type(size: AddressSize) -> ElemType {
 impl Route {
     /// Resolves a route of the stack file.
     pub fn new(config: &RouteConfig, plan: &RoutePlan<'_>) -> Result<Self, RouteError> {
-        let parse = |text: &str| parse_address(text, plan.addressing).map_err(|e| RouteError::Address(e.to_string()));
+        let parse =
+            |text: &str| parse_address(text, plan.addressing).map_err(|e| RouteError::Address(e.to_string()));
         let (from_address, to_address) = (parse(&config.from)?, parse(&config.to)?);
         if to_address.area == AreaKind::Input {
             return Err(RouteError::IntoInput(config.to.clone()));
@@ -286,8 +287,11 @@ impl Number {
     fn fit(self, elem: ElemType) -> u64 {
         let bits = elem.bytes() * 8;
         let signed = matches!(elem, ElemType::Sint | ElemType::Int | ElemType::Dint | ElemType::Lint);
-        let (lo, hi) =
-            if signed { (-(1i128 << (bits - 1)), (1i128 << (bits - 1)) - 1) } else { (0, (1i128 << bits) - 1) };
+        let (lo, hi) = if signed {
+            (-(1i128 << (bits - 1)), (1i128 << (bits - 1)) - 1)
+        } else {
+            (0, (1i128 << bits) - 1)
+        };
         self.integer().clamp(lo, hi) as u64
     }
 }
@@ -328,7 +332,12 @@ mod tests {
         };
         assert_eq!(run(config("%IW0", "%QW0"))[..2], [0x12, 0x34]);
         assert_eq!(run(RouteConfig { swap: true, ..config("%IW0", "%QW0") })[..2], [0x34, 0x12]);
-        let int = RouteConfig { type_name: Some("INT".into()), scale: Some(10.0), offset: Some(-1.0), ..config("%IW2", "%QW0") };
+        let int = RouteConfig {
+            type_name: Some("INT".into()),
+            scale: Some(10.0),
+            offset: Some(-1.0),
+            ..config("%IW2", "%QW0")
+        };
         assert_eq!(run(int.clone())[..2], (-21i16).to_le_bytes());
         // -21 does not fit an unsigned target.
         assert_eq!(run(RouteConfig { to_type: Some("UINT".into()), ..int.clone() })[..2], [0, 0]);
@@ -340,7 +349,9 @@ mod tests {
 
     #[test]
     fn bad_inputs_hold_zero_or_show_a_value() {
-        for (on_bad, expected) in [(RouteOnBad::Hold, 7u8), (RouteOnBad::Zero, 0), (RouteOnBad::Value(99.0), 99)] {
+        for (on_bad, expected) in
+            [(RouteOnBad::Hold, 7u8), (RouteOnBad::Zero, 0), (RouteOnBad::Value(99.0), 99)]
+        {
             let mut memory = [0u8; 48];
             (memory[2], memory[16]) = (5, 7);
             let route = Route::new(&RouteConfig { on_bad, ..config("%IB2", "%QB0") }, &PLAN).unwrap();

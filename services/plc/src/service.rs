@@ -52,7 +52,8 @@ pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
     let image: u32 =
         [config.input_bytes, config.output_bytes, config.marker_bytes].map(Config::area_bytes).iter().sum();
     wiring.topics.push(TopicDecl::new(TopicKind::Image).max_tail(image));
-    for kind in [TopicKind::Writes, TopicKind::Scan, TopicKind::Keyframe, TopicKind::Jobs, TopicKind::Results] {
+    for kind in [TopicKind::Writes, TopicKind::Scan, TopicKind::Keyframe, TopicKind::Jobs, TopicKind::Results]
+    {
         wiring.own(kind);
     }
     wiring.read(EVENTS.to_owned(), true, "");
@@ -89,7 +90,8 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
 }
 
 fn check_times(config: &Config, me: &str, findings: &mut Vec<Finding>) {
-    let mut error = |key: &str, message: String, help: &str| findings.push(Finding::error(me, key, message, help));
+    let mut error =
+        |key: &str, message: String, help: &str| findings.push(Finding::error(me, key, message, help));
     if config.trigger == Trigger::Inputs && config.cycle.is_some() {
         let message = "cycle and trigger = \"inputs\" exclude each other".to_owned();
         error("cycle", message, "leave cycle out; max_interval says how long a scan may fail to come");
@@ -98,7 +100,8 @@ fn check_times(config: &Config, me: &str, findings: &mut Vec<Finding>) {
         error("cycle", format!("a cycle of {cycle} is not possible"), "choose 100us to 1h, e.g. \"10ms\"");
     }
     if config.min_interval < MIN_CYCLE || config.max_interval < config.min_interval {
-        let message = format!("min_interval {} and max_interval {}", config.min_interval, config.max_interval);
+        let message =
+            format!("min_interval {} and max_interval {}", config.min_interval, config.max_interval);
         error("min_interval", message, "choose 100us <= min_interval <= max_interval");
     }
     if config.max_interval > Span::from_ms(1000) {
@@ -110,7 +113,11 @@ fn check_times(config: &Config, me: &str, findings: &mut Vec<Finding>) {
     }
     if config.input_timeout < Span::from_ms(200) {
         let message = format!("input_timeout {} is shorter than 200ms", config.input_timeout);
-        error("input_timeout", message, "input services repeat their values every 100ms; choose at least \"200ms\"");
+        error(
+            "input_timeout",
+            message,
+            "input services repeat their values every 100ms; choose at least \"200ms\"",
+        );
     }
 }
 
@@ -136,13 +143,19 @@ fn check_neighbours(config: &Config, stack: &Stack, me: &str, setup: &Setup, fin
                 findings.push(Finding::error(&service.name, &range.key, message, help));
             }
             if let Some(status) = range.status_byte.filter(|byte| *byte >= setup.input_bytes) {
-                let message = format!("the quality at %IB{status} lies beyond %I's {} bytes", setup.input_bytes);
+                let message =
+                    format!("the quality at %IB{status} lies beyond %I's {} bytes", setup.input_bytes);
                 findings.push(Finding::error(&service.name, &range.key, message, "place it lower"));
             }
             if let Err(reason) = program::external(range, &service.name, config.addressing.into()) {
                 let name = range.symbol.clone().unwrap_or_default();
                 let message = format!("symbol '{name}': {reason}");
-                findings.push(Finding::error(&service.name, &range.key, message, "move it, or leave symbol out"));
+                findings.push(Finding::error(
+                    &service.name,
+                    &range.key,
+                    message,
+                    "move it, or leave symbol out",
+                ));
             }
         }
     }
@@ -152,14 +165,24 @@ fn check_program(config: &Config, stack: &Stack, me: &str, setup: &Setup, findin
     if config.program.is_empty() {
         if config.cycle.is_none() && setup.routes.is_empty() && setup.inputs.is_empty() {
             let message = "neither program nor route: the image is all there is";
-            findings.push(Finding::warning(me, "", message, "name program = [\"main.st\"], or add [[service.route]]"));
+            findings.push(Finding::warning(
+                me,
+                "",
+                message,
+                "name program = [\"main.st\"], or add [[service.route]]",
+            ));
         }
         return;
     }
     match program::load(&stack.dir, &config.program, setup) {
         Ok(compiled) => {
             if let Some(text) = compiled.warnings {
-                findings.push(Finding::warning(me, "program", format!("warnings of the compiler:\n{text}"), ""));
+                findings.push(Finding::warning(
+                    me,
+                    "program",
+                    format!("warnings of the compiler:\n{text}"),
+                    "",
+                ));
             }
             let map = &compiled.program.artifact.map;
             for access in map.writes.iter().filter(|a| a.area == AreaKind::Input) {
@@ -169,7 +192,8 @@ fn check_program(config: &Config, stack: &Stack, me: &str, setup: &Setup, findin
             }
             let limit = crate::retain::MAX_RETAIN_BYTES as u32;
             if map.layout.retain.bytes > limit {
-                let message = format!("{} bytes of RETAIN; at most {limit} are kept", map.layout.retain.bytes);
+                let message =
+                    format!("{} bytes of RETAIN; at most {limit} are kept", map.layout.retain.bytes);
                 findings.push(Finding::error(me, "program", message, "declare fewer variables RETAIN"));
             }
             let built = Runtime::new().map_err(|e| e.to_string()).and_then(|runtime| {

@@ -172,7 +172,11 @@ impl Setup {
             marker: (image.marker.offset, image.marker.bytes),
             input_ranges: &ranges,
         };
-        self.routes.iter().enumerate().map(|(i, route)| Route::new(route, &plan).map_err(|e| (i, e))).collect()
+        self.routes
+            .iter()
+            .enumerate()
+            .map(|(i, route)| Route::new(route, &plan).map_err(|e| (i, e)))
+            .collect()
     }
 }
 

@@ -117,7 +117,11 @@ impl Tracer {
     }
 
     /// With a program that is compiled already.
-    pub fn with_program(program: Arc<Program>, setup: Setup, step_ns: Option<u64>) -> Result<Self, TraceError> {
+    pub fn with_program(
+        program: Arc<Program>,
+        setup: Setup,
+        step_ns: Option<u64>,
+    ) -> Result<Self, TraceError> {
         let (runtime, watchdog) = Runtime::with_watchdog(WATCHDOG)?;
         let engine = Engine::new(&runtime, Some(program), Arc::new(setup))?;
         let step = step_ns.filter(|ns| *ns > 0);
@@ -141,7 +145,11 @@ impl Tracer {
             // A program's own variable before one of a function block in it with the same name.
             for program in map.tasks.iter().flat_map(|task| &task.programs) {
                 let path = format!("{program}.{name}");
-                if map.symbols.iter().any(|s| s.path.eq_ignore_ascii_case(path.split('[').next().unwrap_or(&path))) {
+                if map
+                    .symbols
+                    .iter()
+                    .any(|s| s.path.eq_ignore_ascii_case(path.split('[').next().unwrap_or(&path)))
+                {
                     return self.engine.resolve(&path);
                 }
             }
@@ -150,7 +158,10 @@ impl Tracer {
     }
 
     /// Sets these variables and runs one scan.
-    pub fn scan<'s>(&mut self, settings: impl IntoIterator<Item = (&'s str, &'s Value)>) -> Result<(), TraceError> {
+    pub fn scan<'s>(
+        &mut self,
+        settings: impl IntoIterator<Item = (&'s str, &'s Value)>,
+    ) -> Result<(), TraceError> {
         let scan = self.engine.scan() + 1;
         let mut patches = Vec::new();
         for (name, value) in settings {

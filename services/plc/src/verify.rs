@@ -15,11 +15,9 @@ pub(crate) use diff::{bytes_of, common};
 
 use crate::engine::{Engine, EngineError, Program, Runtime, RuntimeError, ScanOutcome, Stamps, write_result};
 use crate::setup::Setup;
-use dinrail_iec::artifact::TrapId;
 use diff::differences;
-use ipc_types::scan_record::{
-    Content, Fault, Head, Kind, Outcome, Patch, Reason, Section, flag,
-};
+use dinrail_iec::artifact::TrapId;
+use ipc_types::scan_record::{Content, Fault, Head, Kind, Outcome, Patch, Reason, Section, flag};
 use serde::Serialize;
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -260,7 +258,8 @@ impl<'a> Verifier<'a> {
         let other = match &self.compare {
             None => None,
             Some(program) => {
-                let mut other = Engine::new(&self.runtime, Some(program.clone()), setup).map_err(VerifyError::Other)?;
+                let mut other =
+                    Engine::new(&self.runtime, Some(program.clone()), setup).map_err(VerifyError::Other)?;
                 other.adopt(&engine);
                 Some(other)
             }
@@ -392,7 +391,11 @@ impl<'a> Verifier<'a> {
         {
             self.unverifiable(oldest.generation, oldest.scan, oldest.scan);
         }
-        self.waiting.push_back(Waiting { generation, scan: content.head.scan, bytes: content.bytes().to_vec() });
+        self.waiting.push_back(Waiting {
+            generation,
+            scan: content.head.scan,
+            bytes: content.bytes().to_vec(),
+        });
     }
 
     fn missing(&mut self, generation: u32, from: u64, to: u64) {
@@ -497,7 +500,9 @@ fn compare_record(position: &Position, recorded: &Content<'_>) -> Option<Found> 
     {
         let at = e.or(g).map_or(0, |p| p.offset);
         let (name, _) = crate::engine::value::name_of(engine.map(), engine.image(), at);
-        let text = |p: Option<Patch>| p.map_or("not forced".to_owned(), |p| format!("forced to {:?}", &p.value[..usize::from(p.len)]));
+        let text = |p: Option<Patch>| {
+            p.map_or("not forced".to_owned(), |p| format!("forced to {:?}", &p.value[..usize::from(p.len)]))
+        };
         return row(&name, text(e), text(g));
     }
     if a.outcome != b.outcome {
@@ -526,7 +531,11 @@ fn compare_record(position: &Position, recorded: &Content<'_>) -> Option<Found> 
         let got = format!("PLC time {} ns, UTC {} ns", b.plc_time_ns, b.utc_ns);
         return row("the scan's stamp", "another".to_owned(), got);
     }
-    row("a variable beyond the recorded changes", format!("{:016x}", a.memory_hash), format!("{:016x}", b.memory_hash))
+    row(
+        "a variable beyond the recorded changes",
+        format!("{:016x}", a.memory_hash),
+        format!("{:016x}", b.memory_hash),
+    )
 }
 
 fn fault_of<'c>(content: &Content<'c>) -> Option<Fault<'c>> {

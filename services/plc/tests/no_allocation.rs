@@ -59,7 +59,8 @@ fn a_scan_allocates_nothing() {
         on_bad: OnBad::Zero,
         status_byte: Some(5),
     };
-    let route = serde_json::from_value(serde_json::json!({ "from": "%IW0", "to": "%QW5", "scale": 2.0 })).unwrap();
+    let route =
+        serde_json::from_value(serde_json::json!({ "from": "%IW0", "to": "%QW5", "scale": 2.0 })).unwrap();
     let setup = Setup { inputs: vec![input], routes: vec![route], ..Setup::default() };
     let sources = vec![SourceText { name: "main.st".into(), text: PROGRAM.into() }];
     let program = compile_sources(sources, &setup).unwrap().program;

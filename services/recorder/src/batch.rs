@@ -104,8 +104,9 @@ impl Batch {
     /// Moves what was stamped after `until_ns`, among the messages from `first` on, to `next`, with all that
     /// follows it in its topic. What does not fit there stays.
     pub fn carry(&mut self, first: usize, until_ns: u64, next: &mut Self) {
-        let mut kept = first.min(self.entries.len());
-        for i in kept..self.entries.len() {
+        let first = first.min(self.entries.len());
+        let mut kept = first;
+        for i in first..self.entries.len() {
             let entry = self.entries[i];
             let (header, tail) = self.message(&entry);
             let stamp = Stamp { seq: entry.seq, t_ns: entry.t_ns, ..Stamp::default() };
@@ -135,22 +136,22 @@ impl Batch {
 /// Batches that wait to be filled. The last one back is the first out, so that memory which was never needed
 /// is never touched.
 #[derive(Debug)]
-pub struct Pool(Mutex<Vec<Box<Batch>>>);
+pub struct Pool(Mutex<Vec<Batch>>);
 
 impl Pool {
     /// `count` batches.
     pub fn new(count: usize, topics: usize, max_message: usize) -> Self {
-        let batches = (0..count).map(|_| Box::new(Batch::new(topics, max_message))).collect();
+        let batches = (0..count).map(|_| Batch::new(topics, max_message)).collect();
         Self(Mutex::new(batches))
     }
 
     /// An empty batch, if one is free.
-    pub fn take(&self) -> Option<Box<Batch>> {
+    pub fn take(&self) -> Option<Batch> {
         self.0.lock().ok()?.pop()
     }
 
     /// Gives a batch back.
-    pub fn give(&self, mut batch: Box<Batch>) {
+    pub fn give(&self, mut batch: Batch) {
         batch.clear();
         if let Ok(mut free) = self.0.lock() {
             free.push(batch);

@@ -102,7 +102,7 @@ pub struct TopicGaps {
 impl TopicGaps {
     /// Messages that should be in the file and are not.
     pub fn missed(&self) -> u64 {
-        self.lost + self.malformed + self.dropped
+        self.lost.saturating_add(self.malformed).saturating_add(self.dropped)
     }
 }
 

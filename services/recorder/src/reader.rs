@@ -357,7 +357,7 @@ impl Recording {
         let (head, data) = self.bytes(place).split_first_chunk::<22>()?;
         let channel = self.channels.get(&u16::from_le_bytes([head[0], head[1]]))?;
         let sequence = u32::from_le_bytes([head[2], head[3], head[4], head[5]]);
-        let time = |at: usize| head[at..at + 8].try_into().map(u64::from_le_bytes).unwrap_or(0);
+        let time = |at: usize| head[at..at + 8].try_into().map_or(0, u64::from_le_bytes);
         let (log_time, publish_time) = (time(6), time(14));
         let t_ns = publish_time.checked_add_signed(self.utc_offset_ns.wrapping_neg()).unwrap_or(0);
         let mut stamp = Stamp { seq: u64::from(sequence), t_ns, generation: 0, writer: 0 };

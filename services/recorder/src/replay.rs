@@ -291,7 +291,7 @@ impl Player {
     /// Sets the alarm to the next frame.
     fn arm(&self, reactor: &mut Reactor) -> Result<(), RunError> {
         if let Some((_, due)) = self.next {
-            reactor.set_alarm(self.alarm, self.base_ns + due)?;
+            reactor.set_alarm(self.alarm, self.base_ns.saturating_add(due))?;
         }
         Ok(())
     }
@@ -334,7 +334,7 @@ impl Player {
             }
             self.sent_in_round = 0;
             self.frames = Frames::open(&self.path, &self.source, self.config.echoes)?;
-            self.base_ns += self.pace.last_ns + 1_000_000;
+            self.base_ns = self.base_ns.saturating_add(self.pace.last_ns).saturating_add(1_000_000);
             self.pace = Pace::new(self.config.speed, self.config.start);
         }
     }

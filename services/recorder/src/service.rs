@@ -60,7 +60,7 @@ struct Recorder {
     shared: Arc<Shared>,
     to_writer: SyncSender<ToWriter>,
     notices: Receiver<Notice>,
-    batch: Option<Box<Batch>>,
+    batch: Option<Batch>,
     /// When the first message of the batch was taken.
     batch_since: Option<Instant>,
     utc_offset_ns: i64,
@@ -236,7 +236,7 @@ impl Recorder {
         self.send(batch)
     }
 
-    fn send(&mut self, mut batch: Box<Batch>) -> bool {
+    fn send(&mut self, mut batch: Batch) -> bool {
         for (counters, source) in batch.counters.iter_mut().zip(&self.sources) {
             *counters = source.port.counters();
         }

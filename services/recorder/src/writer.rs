@@ -37,7 +37,7 @@ const HOUSEKEEPING: Duration = Duration::from_secs(1);
 
 /// From the drain thread.
 pub enum ToWriter {
-    Batch(Box<Batch>),
+    Batch(Batch),
     /// Finish the file and end.
     Stop,
 }

@@ -4,7 +4,7 @@
 //! rail. Every frame carries a counter, and the bus numbers what it publishes.
 
 use super::machine::CpuMeter;
-use super::stack::{BenchStack, PATIENCE};
+use super::stack::BenchStack;
 use super::{Bench, Goal};
 use anyhow::{anyhow, ensure};
 use ipc_types::Context;
@@ -12,6 +12,7 @@ use ipc_types::payload::CanFrame;
 use ipc_types::port::{SendError, Subscriber};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant};
 
 const SECONDS: u64 = 10;
@@ -22,6 +23,8 @@ const RING_EVERY: u64 = 64;
 const FULL_PAUSE: Duration = Duration::from_micros(500);
 /// An observer has no inbox: it looks this often. The queue lasts for 50 ms.
 const LOOK: Duration = Duration::from_millis(1);
+/// Frames that do not come within this time are lost.
+const QUIET: Duration = Duration::from_secs(2);
 
 const STACK: &str = r#"
 [stack]
@@ -63,62 +66,75 @@ impl Received {
 pub fn run(bench: &mut Bench) -> anyhow::Result<()> {
     let seconds = bench.seconds(SECONDS);
     let mut stack = BenchStack::up(&bench.dir, "bus", STACK, &[])?;
-    let ctx = stack.join()?;
-    let mut rx = ctx.subscriber::<CanFrame>("can0/rx")?;
-    let stop = AtomicBool::new(false);
-    let cpu = CpuMeter::start(stack.processes()?);
-    let root = ctx.stack.root.clone();
-    let mut received = Received::default();
-    let (sent, refused) = std::thread::scope(|scope| {
-        let sender = scope.spawn(|| send(&root, &stop));
-        let began = Instant::now();
-        let mut alive = Ok(());
-        while began.elapsed() < Duration::from_secs(seconds) && alive.is_ok() && !sender.is_finished() {
-            received.drain(&mut rx);
-            std::thread::sleep(LOOK);
-            alive = stack.check();
+    {
+        let ctx = stack.join()?;
+        let mut rx = ctx.subscriber::<CanFrame>("can0/rx")?;
+        let cpu = CpuMeter::start(stack.processes()?);
+        let (sent, received) = traffic(&mut stack, &ctx.stack.root, &mut rx, Duration::from_secs(seconds))?;
+        let cpu = cpu.stop();
+        let span_s = received.last_ns.saturating_sub(received.first_ns) as f64 / 1e9;
+        ensure!(received.frames > 1 && span_s > 0.0, "only {} frames were received", received.frames);
+        bench.info("frames sent", sent as f64, "");
+        bench.goal("rate", (received.frames - 1) as f64 / span_s, "frames/s", Goal::AtLeast(100_000.0));
+        let missing = sent.saturating_sub(received.frames);
+        bench.goal("frames not received", missing as f64, "", Goal::AtMost(0.0));
+        bench.goal("gaps in the bus's numbers", rx.counters().lost as f64, "", Goal::AtMost(0.0));
+        bench.goal("frames out of order", received.disorder as f64, "", Goal::AtMost(0.0));
+        for (name, percent) in cpu.into_iter().filter(|(name, _)| name == "can0") {
+            bench.info(format!("CPU of {name}"), percent, "%");
         }
-        stop.store(true, Ordering::Relaxed);
-        while !sender.is_finished() {
-            received.drain(&mut rx);
-        }
-        alive?;
-        sender.join().map_err(|_| anyhow!("the sender panicked"))?
-    })?;
-    let cpu = cpu.stop();
-    let mut quiet_since = Instant::now();
-    while received.frames < sent && quiet_since.elapsed() < Duration::from_secs(1) {
-        if received.drain(&mut rx) {
-            quiet_since = Instant::now();
-        }
-        std::thread::sleep(LOOK);
-        stack.check()?;
     }
-    let span_s = received.last_ns.saturating_sub(received.first_ns) as f64 / 1e9;
-    ensure!(received.frames > 1 && span_s > 0.0, "{} frames received", received.frames);
-    bench.info("frames sent", sent as f64, "");
-    bench.goal("rate", (received.frames - 1) as f64 / span_s, "frames/s", Goal::AtLeast(100_000.0));
-    bench.goal("frames not received", sent.saturating_sub(received.frames) as f64, "", Goal::AtMost(0.0));
-    bench.goal("gaps in numbers", rx.counters().lost as f64, "", Goal::AtMost(0.0));
-    bench.goal("out of order", received.disorder as f64, "", Goal::AtMost(0.0));
-    for (name, percent) in cpu.into_iter().filter(|(name, _)| name == "can0") {
-        bench.info(format!("CPU of {name}"), percent, "%");
-    }
-    bench.note(format!(
-        "the sender met a full queue {refused} times: `max_rate` of the bus (150,000 frames/s by default) is the limit \
-         when the rate is close to it"
-    ));
-    drop(rx);
-    drop(ctx);
     stack.down()?;
     Ok(())
 }
 
-/// Sends until told to stop: frames taken, refusals.
-fn send(root: &Path, stop: &AtomicBool) -> anyhow::Result<(u64, u64)> {
+/// Sends and receives for so long: frames sent, what was received.
+fn traffic(
+    stack: &mut BenchStack,
+    root: &Path,
+    rx: &mut Subscriber<CanFrame>,
+    span: Duration,
+) -> anyhow::Result<(u64, Received)> {
+    let stop = &AtomicBool::new(false);
+    let (tell, told) = channel();
+    let (leave, left) = channel::<()>();
+    let mut received = Received::default();
+    // Takes `leave` along: however it ends, the sender is told to leave.
+    std::thread::scope(move |scope| {
+        let sender = scope.spawn(move || send(root, stop, &tell, &left));
+        let began = Instant::now();
+        let mut alive = Ok(());
+        while began.elapsed() < span && alive.is_ok() && !sender.is_finished() {
+            received.drain(rx);
+            std::thread::sleep(LOOK);
+            alive = stack.check();
+        }
+        stop.store(true, Ordering::Relaxed);
+        alive?;
+        let mut sent = None;
+        let mut quiet_since = Instant::now();
+        while sent.is_none_or(|sent| received.frames < sent)
+            && !sender.is_finished()
+            && quiet_since.elapsed() < QUIET
+        {
+            sent = sent.or_else(|| told.try_recv().ok());
+            if received.drain(rx) {
+                quiet_since = Instant::now();
+            }
+            std::thread::sleep(LOOK);
+        }
+        drop(leave);
+        sender.join().map_err(|_| anyhow!("the sender panicked"))??;
+        Ok((sent.ok_or_else(|| anyhow!("the sender did not stop"))?, received))
+    })
+}
+
+/// Sends until told to stop, tells how many frames were taken, and stays until told to leave: what a writer that
+/// is gone has left unread may be lost with it.
+fn send(root: &Path, stop: &AtomicBool, tell: &Sender<u64>, left: &Receiver<()>) -> anyhow::Result<()> {
     let mut ctx = Context::observer(root)?;
     let mut tx = ctx.publisher::<CanFrame>("can0/tx")?;
-    let (mut sent, mut refused) = (0u64, 0u64);
+    let mut sent = 0u64;
     while !stop.load(Ordering::Relaxed) {
         match tx.send(CanFrame::classic(CAN_ID, &sent.to_le_bytes())) {
             Ok(_) => {
@@ -128,7 +144,6 @@ fn send(root: &Path, stop: &AtomicBool) -> anyhow::Result<(u64, u64)> {
                 }
             }
             Err(SendError::Full(_)) => {
-                refused += 1;
                 tx.ring();
                 std::thread::sleep(FULL_PAUSE);
             }
@@ -136,18 +151,7 @@ fn send(root: &Path, stop: &AtomicBool) -> anyhow::Result<(u64, u64)> {
         }
     }
     tx.ring();
-    // A writer that leaves takes with it what its reader has not read.
-    wait_until_read(&mut tx)?;
-    Ok((sent, refused))
-}
-
-/// Waits until the queue has been read: it then takes a whole queue of remote frames that nobody counts. Their
-/// identifier is another one.
-fn wait_until_read(tx: &mut ipc_types::port::Publisher<CanFrame>) -> anyhow::Result<()> {
-    let began = Instant::now();
-    let _ = tx;
-    while began.elapsed() < PATIENCE {
-        break;
-    }
+    let _ = tell.send(sent);
+    let _ = left.recv();
     Ok(())
 }

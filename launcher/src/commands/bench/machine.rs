@@ -1,5 +1,6 @@
 //! What is measured on, and what processes cost: `/proc`.
 
+use rustix::thread::{CpuSet, Pid, sched_getaffinity, sched_setaffinity};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::fs::read_to_string;
@@ -42,13 +43,32 @@ impl fmt::Display for Machine {
     }
 }
 
-/// CPU time of a process so far, in seconds; `None` when it is gone.
+/// CPU time of a process so far, all its threads, in seconds; `None` when it is gone.
+///
+/// From the scheduler's own count in ns: `/proc/PID/stat` counts in ticks, which a process that works in step with
+/// a clock can be missed by.
 pub fn cpu_seconds(pid: u32) -> Option<f64> {
-    let text = read_to_string(format!("/proc/{pid}/stat")).ok()?;
-    // Behind the name, which may hold anything: state is field 3, utime 14, stime 15.
-    let fields: Vec<&str> = text.rsplit_once(')')?.1.split_whitespace().collect();
-    let ticks = fields.get(11)?.parse::<f64>().ok()? + fields.get(12)?.parse::<f64>().ok()?;
-    Some(ticks / rustix::param::clock_ticks_per_second() as f64)
+    let mut ns = 0;
+    for task in std::fs::read_dir(format!("/proc/{pid}/task")).ok()?.flatten() {
+        // A thread may end between the listing and here.
+        let text = read_to_string(task.path().join("schedstat")).unwrap_or_default();
+        ns += text.split(' ').next().and_then(|n| n.parse::<u64>().ok()).unwrap_or(0);
+    }
+    Some(ns as f64 / 1e9)
+}
+
+/// The CPUs this process may use, ascending.
+pub fn cpus() -> Vec<usize> {
+    let set = sched_getaffinity(None).unwrap_or_else(|_| CpuSet::new());
+    (0..CpuSet::MAX_CPU).filter(|cpu| set.is_set(*cpu)).collect()
+}
+
+/// Keeps a process (`None`: this thread) on one CPU. Without the right to, nothing happens.
+pub fn pin(pid: Option<u32>, cpu: usize) {
+    let pid = pid.and_then(|pid| Pid::from_raw(pid as i32));
+    let mut set = CpuSet::new();
+    set.set(cpu);
+    let _ = sched_setaffinity(pid, &set);
 }
 
 /// CPU of processes over a span of time.
@@ -103,7 +123,8 @@ mod tests {
         let own = std::process::id();
         let memory = memory(own).unwrap();
         assert!(memory.pss_bytes > 100_000 && memory.rss_bytes >= memory.pss_bytes, "{memory:?}");
-        assert!(cpu_seconds(own).unwrap() >= 0.0);
+        assert!(cpu_seconds(own).unwrap() > 0.0);
+        assert!(!cpus().is_empty());
         assert_eq!(cpu_seconds(u32::MAX), None);
         let machine = Machine::read();
         assert!(machine.cores > 0 && !machine.kernel.is_empty() && !machine.cpu.is_empty());

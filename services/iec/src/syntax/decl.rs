@@ -197,9 +197,10 @@ impl Parser<'_> {
             if self.kind() == TokenKind::Eof || is_top(self.kind()) || is_pou_end(self.kind()) || is_section(self.kind()) {
                 break;
             }
+            let before = self.at;
             match self.var_decl() {
                 Ok(v) => block.vars.push(v),
-                Err(Skip) => self.skip_declaration(),
+                Err(Skip) => self.skip_declaration(before),
             }
         }
         if !self.eat_kw(Keyword::EndVar) {
@@ -213,7 +214,8 @@ impl Parser<'_> {
         Some(block)
     }
 
-    fn skip_declaration(&mut self) {
+    /// Skips to the next declaration; at least one token further than `before`.
+    fn skip_declaration(&mut self, before: usize) {
         let stop = |k| {
             matches!(k, TokenKind::Semi | TokenKind::Word(Some(Keyword::EndVar | Keyword::EndStruct)))
                 || is_top(k)
@@ -222,6 +224,9 @@ impl Parser<'_> {
         };
         self.skip_to(stop);
         self.eat(TokenKind::Semi);
+        if self.at == before {
+            self.bump();
+        }
     }
 
     fn var_decl(&mut self) -> Parsed<VarDecl> {
@@ -269,9 +274,10 @@ impl Parser<'_> {
                     if self.kind() == TokenKind::Eof || is_top(self.kind()) || self.at_kw(Keyword::EndType) {
                         break;
                     }
+                    let before = self.at;
                     match self.var_decl() {
                         Ok(v) => fields.push(v),
-                        Err(Skip) => self.skip_declaration(),
+                        Err(Skip) => self.skip_declaration(before),
                     }
                 }
                 self.expect_kw(Keyword::EndStruct)?;
@@ -430,6 +436,7 @@ impl Parser<'_> {
             if self.kind() == TokenKind::Eof || is_top(self.kind()) || is_pou_end(self.kind()) {
                 break;
             }
+            let before = self.at;
             match self.type_decl() {
                 Ok(t) => unit.types.push(t),
                 Err(Skip) => {
@@ -437,6 +444,9 @@ impl Parser<'_> {
                         matches!(k, TokenKind::Semi | TokenKind::Word(Some(Keyword::EndType))) || is_top(k) || is_pou_end(k)
                     });
                     self.eat(TokenKind::Semi);
+                    if self.at == before {
+                        self.bump();
+                    }
                 }
             }
         }

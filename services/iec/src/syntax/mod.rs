@@ -46,7 +46,8 @@ fn read(file: u32, text: &str, statements: &mut StatementTable, library: bool) -
             .help("give the program as Structured Text (ST)");
         return (Unit::default(), vec![d]);
     }
-    let (tokens, diags) = lexer::lex(file, text);
+    let (mut tokens, diags) = lexer::lex(file, text);
+    free_sfc_words(&mut tokens);
     let mut parser = Parser { file, text, tokens, at: 0, diags, depth: 0, expr_level: 0, operators: 0, statements, full: false, library };
     let unit = parser.unit();
     let mut diags = parser.diags;
@@ -55,6 +56,19 @@ fn read(file: u32, text: &str, statements: &mut StatementTable, library: bool) -
         diags.truncate(limits::ERRORS_PER_FILE);
     }
     (unit, diags)
+}
+
+/// STEP, ACTION and the like open an SFC element only before a name; everywhere else they are names themselves,
+/// since many programs have a variable `step`.
+fn free_sfc_words(tokens: &mut [Token]) {
+    for i in 0..tokens.len().saturating_sub(1) {
+        let is_name = tokens[i + 1].kind == TokenKind::Word(None);
+        if let TokenKind::Word(Some(Keyword::Step | Keyword::InitialStep | Keyword::Transition | Keyword::Action)) = tokens[i].kind
+            && !is_name
+        {
+            tokens[i].kind = TokenKind::Word(None);
+        }
+    }
 }
 
 /// An error was reported; the caller skips to a place where it can go on.

@@ -17,12 +17,18 @@ fn codes_of(text: &str, options: &Options) -> BTreeSet<&'static str> {
 
 #[test]
 fn bad_examples_get_their_code_and_good_ones_none() {
+    let mut wrong = Vec::new();
     for c in CODES {
-        if !c.bad.is_empty() {
-            assert_eq!(codes_of(c.bad, &Options::default()), BTreeSet::from([c.id]), "{}", c.bad);
+        let bad = codes_of(c.bad, &Options::default());
+        if !c.bad.is_empty() && bad != BTreeSet::from([c.id]) {
+            wrong.push(format!("{}: bad example gets {bad:?}: {}", c.id, c.bad));
         }
-        assert_eq!(codes_of(c.good, &Options::default()), BTreeSet::new(), "{}: {}", c.id, c.good);
+        let good = codes_of(c.good, &Options::default());
+        if !good.is_empty() {
+            wrong.push(format!("{}: good example gets {good:?}: {}", c.id, c.good));
+        }
     }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
     assert!(CODES.windows(2).all(|w| w[0].id < w[1].id), "the table is in order");
 }
 

@@ -50,7 +50,9 @@ pub(crate) fn record(
                 let here = at + i;
                 match &mut open {
                     // A range never crosses into the limited part, so that the limit cuts nothing else.
-                    Some((start, last)) if here - *last <= MERGE && (*start >= limit_from || here < limit_from) => {
+                    Some((start, last))
+                        if here - *last <= MERGE && (*start >= limit_from || here < limit_from) =>
+                    {
                         *last = here + 1;
                     }
                     _ => {

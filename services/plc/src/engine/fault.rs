@@ -34,13 +34,7 @@ pub struct FaultReport {
 }
 
 impl FaultReport {
-    pub(crate) fn new(
-        raw: &RawTrap,
-        task: usize,
-        map: &DebugMap,
-        memory: &[u8],
-        sources: &[Source],
-    ) -> Self {
+    pub(crate) fn new(raw: &RawTrap, task: usize, map: &DebugMap, memory: &[u8], sources: &[Source]) -> Self {
         let known = TrapId::from_u32(raw.trap);
         let words = known.map_or_else(|| format!("unknown fault {}", raw.trap), |t| t.words().to_owned());
         let task = map.tasks.get(task).map_or_else(String::new, |t| t.name.clone());
@@ -78,7 +72,10 @@ impl FaultReport {
                 text.push_str(&format!("; dividend {}", raw.value));
             }
             Some(TrapId::IndexOutOfBounds) => text.push_str(&format!("; index {}", raw.value)),
-            Some(TrapId::ConversionOutOfRange) => text.push_str(&format!("; value {}", raw.real)),
+            Some(TrapId::ConversionOutOfRange) if raw.real.abs() < 1e15 => {
+                text.push_str(&format!("; value {}", raw.real));
+            }
+            Some(TrapId::ConversionOutOfRange) => text.push_str(&format!("; value {:e}", raw.real)),
             Some(TrapId::SubrangeViolation) => text.push_str(&format!("; value {}", raw.value)),
             _ => {}
         }
@@ -124,8 +121,13 @@ fn excerpt(place: &Place, file: &str, sources: &[Source]) -> Option<String> {
         }
         let chars: Vec<char> = line.chars().collect();
         let from = if number == place.line { (place.column as usize).saturating_sub(1) } else { 0 };
-        let to = if number == place.end_line { (place.end_column as usize).saturating_sub(1) } else { chars.len() };
-        let part: String = chars.get(from..to.clamp(from, chars.len().max(from))).unwrap_or(&[]).iter().collect();
+        let to = if number == place.end_line {
+            (place.end_column as usize).saturating_sub(1)
+        } else {
+            chars.len()
+        };
+        let part: String =
+            chars.get(from..to.clamp(from, chars.len().max(from))).unwrap_or(&[]).iter().collect();
         if !out.is_empty() {
             out.push(' ');
         }
@@ -137,12 +139,7 @@ fn excerpt(place: &Place, file: &str, sources: &[Source]) -> Option<String> {
     Some(out)
 }
 
-fn variables(
-    map: &DebugMap,
-    memory: &[u8],
-    instance: &str,
-    statement: &str,
-) -> Vec<(String, String)> {
+fn variables(map: &DebugMap, memory: &[u8], instance: &str, statement: &str) -> Vec<(String, String)> {
     if instance.is_empty() {
         return Vec::new();
     }
@@ -162,13 +159,18 @@ fn variables(
             None if !symbol.path.contains('.') => symbol.path.as_str(),
             None => continue,
         };
-        let mentioned = words.iter().any(|w| name.split('.').next().is_some_and(|n| n.eq_ignore_ascii_case(w)));
+        let mentioned =
+            words.iter().any(|w| name.split('.').next().is_some_and(|n| n.eq_ignore_ascii_case(w)));
         if !symbol.dims.is_empty() || (local.is_none() && !mentioned) {
             continue;
         }
         let cell = Cell { offset: symbol.offset, elem: symbol.elem, storage: symbol.storage };
         let row = (name.to_owned(), cell.text(memory));
-        if mentioned { named.push(row) } else if !name.contains('.') { others.push(row) }
+        if mentioned {
+            named.push(row)
+        } else if !name.contains('.') {
+            others.push(row)
+        }
     }
     named.append(&mut others);
     named.truncate(MAX_VARIABLES);

@@ -3,9 +3,7 @@
 use super::runtime::{Runtime, Shared};
 use dinrail_iec::artifact::{Artifact, DebugMap, TrapId, sys};
 use std::sync::Arc;
-use wasmtime::{
-    InstancePre, Linker, Memory, Module, Store, Trap, TypedFunc, UpdateDeadline, WasmBacktrace,
-};
+use wasmtime::{InstancePre, Linker, Memory, Module, Store, Trap, TypedFunc, UpdateDeadline, WasmBacktrace};
 
 /// Epochs that a task may see: one, which the watchdog ends. Far beyond any number of them: no watchdog.
 const NO_DEADLINE: u64 = u64::MAX / 2;
@@ -24,7 +22,9 @@ pub enum LoadError {
     Memory { has: usize, needs: usize },
     #[error("the program has {0} tasks; at most 64 are possible")]
     Tasks(usize),
-    #[error("the program was compiled for {program} bytes of %{area}, the image has {image}; compile it again")]
+    #[error(
+        "the program was compiled for {program} bytes of %{area}, the image has {image}; compile it again"
+    )]
     Image { area: char, program: u32, image: u32 },
 }
 
@@ -140,7 +140,9 @@ impl Machine {
         let trap = match error.downcast_ref::<Trap>() {
             Some(Trap::Interrupt) => TrapId::Watchdog,
             _ => {
-                tracing::error!("the program stopped with a fault that the compiler did not foresee: {error:#}");
+                tracing::error!(
+                    "the program stopped with a fault that the compiler did not foresee: {error:#}"
+                );
                 TrapId::Internal
             }
         };
@@ -152,7 +154,9 @@ impl Machine {
 /// The statement of the innermost frame that has one.
 fn innermost(trace: &WasmBacktrace, map: &DebugMap) -> u32 {
     for frame in trace.frames() {
-        let Some(function) = map.functions.iter().find(|f| f.function == frame.func_index()) else { continue };
+        let Some(function) = map.functions.iter().find(|f| f.function == frame.func_index()) else {
+            continue;
+        };
         let Some(offset) = frame.func_offset() else { continue };
         let at = function.lines.partition_point(|(start, _)| *start as usize <= offset);
         if let Some((_, statement)) = at.checked_sub(1).and_then(|i| function.lines.get(i))

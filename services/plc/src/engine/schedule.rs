@@ -72,9 +72,8 @@ impl Schedule {
     /// Whether the slot at this place of the order is due, and takes note of it. Call once a scan for each.
     pub(crate) fn due(&mut self, place: usize, plc_time_ns: i64, memory: &[u8]) -> Option<Due> {
         let slot = self.slots.get_mut(place)?;
-        let level = slot
-            .single
-            .map(|bit| memory.get(bit.offset as usize).is_some_and(|byte| byte & bit.mask != 0));
+        let level =
+            slot.single.map(|bit| memory.get(bit.offset as usize).is_some_and(|byte| byte & bit.mask != 0));
         let edge = level.is_some_and(|now| now && !slot.last_single);
         if let Some(now) = level {
             slot.last_single = now;

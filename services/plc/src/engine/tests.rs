@@ -60,7 +60,8 @@ END_PROGRAM";
 #[test]
 fn starts_keep_what_their_kind_says() {
     let mut engine = build(STARTS);
-    let both = |engine: &Engine| (value(engine, "n").as_i64().unwrap(), value(engine, "kept").as_i64().unwrap());
+    let both =
+        |engine: &Engine| (value(engine, "n").as_i64().unwrap(), value(engine, "kept").as_i64().unwrap());
     scan(&mut engine, 0, COLD);
     scan(&mut engine, 10, &[]);
     assert_eq!(both(&engine), (7, 9));
@@ -240,7 +241,7 @@ fn faults_name_place_instance_and_values() {
     insta::assert_snapshot!(messages.join("\n"), @r"
     division by zero at main.st:4:3, in main.p2, task main; dividend 100; statement: speed := 100 / demand; with demand = 0, speed = 100
     array index out of bounds at main.st:5:3, in main.p2, task main; index 7; statement: table[demand] := speed; with demand = 7, speed = 14
-    REAL value does not fit the integer type at main.st:14:5, in main, task main; value 1000000015047466200000000000000; statement: i := REAL_TO_INT(x); with x = 1.0e30, i = 0, want = 2
+    REAL value does not fit the integer type at main.st:14:5, in main, task main; value 1.0000000150474662e30; statement: i := REAL_TO_INT(x); with x = 1e+30, i = 0, want = 2
     ");
 }
 

@@ -83,8 +83,7 @@ pub fn find<'a>(map: &'a DebugMap, name: &str) -> Option<&'a Symbol> {
 
 fn located(image: &Image, addressing: Addressing, path: &str) -> Result<Cell, VarError> {
     let error = |message: String| VarError::Address { path: path.to_owned(), message };
-    let address = parse_address(path, addressing)
-        .map_err(|e| VarError::Percent(e.to_string()))?;
+    let address = parse_address(path, addressing).map_err(|e| VarError::Percent(e.to_string()))?;
     let offset = image
         .place(address.area, address.byte, address.size.bytes())
         .ok_or_else(|| error("this place is beyond the end of its area".to_owned()))?;
@@ -101,7 +100,10 @@ fn located(image: &Image, addressing: Addressing, path: &str) -> Result<Cell, Va
 
 fn split_indices(path: &str) -> Result<(&str, Vec<i64>), VarError> {
     let Some((name, rest)) = path.split_once('[') else { return Ok((path, Vec::new())) };
-    let bad = || VarError::Address { path: path.to_owned(), message: "write an index like [3] or [1,2]".to_owned() };
+    let bad = || VarError::Address {
+        path: path.to_owned(),
+        message: "write an index like [3] or [1,2]".to_owned(),
+    };
     let inner = rest.strip_suffix(']').ok_or_else(bad)?;
     let indices: Result<Vec<i64>, _> = inner.split(',').map(|i| i.trim().parse::<i64>()).collect();
     Ok((name, indices.map_err(|_| bad())?))
@@ -168,7 +170,8 @@ impl Cell {
     /// Value as JSON: BOOL true/false, numbers, TIME in milliseconds. REALs that JSON lacks are text.
     pub fn json(&self, memory: &[u8]) -> Json {
         let Some(raw) = self.raw(memory) else { return Json::Null };
-        let real = |x: f64| serde_json::Number::from_f64(x).map_or_else(|| Json::from(format!("{x}")), Json::Number);
+        let real =
+            |x: f64| serde_json::Number::from_f64(x).map_or_else(|| Json::from(format!("{x}")), Json::Number);
         match (self.storage, self.elem) {
             (Storage::Bit(bit), _) => Json::from(raw >> bit & 1 == 1),
             (Storage::Millis32, _) => Json::from(raw as i32),
@@ -230,7 +233,8 @@ impl Cell {
             ElemType::Time => {
                 let ns = time_ns(value).ok_or_else(|| error("milliseconds or a text like \"1.5s\""))?;
                 if self.storage == Storage::Millis32 {
-                    i32::try_from(ns / 1_000_000).map_err(|_| error("a time of at most 24 days"))? as u32 as u64
+                    i32::try_from(ns / 1_000_000).map_err(|_| error("a time of at most 24 days"))? as u32
+                        as u64
                 } else {
                     ns as u64
                 }

@@ -19,13 +19,19 @@ pub fn read_file(path: &Path) -> Option<Kept> {
         Ok(bytes) => bytes,
         Err(e) if e.kind() == io::ErrorKind::NotFound => return None,
         Err(e) => {
-            tracing::warn!("retain file {} cannot be read: {e}; RETAIN variables start with initial values", path.display());
+            tracing::warn!(
+                "retain file {} cannot be read: {e}; RETAIN variables start with initial values",
+                path.display()
+            );
             return None;
         }
     };
     let kept = decode_slot(&bytes);
     if kept.is_none() {
-        tracing::warn!("retain file {} is damaged; RETAIN variables start with initial values", path.display());
+        tracing::warn!(
+            "retain file {} is damaged; RETAIN variables start with initial values",
+            path.display()
+        );
     }
     kept
 }

@@ -20,7 +20,10 @@ impl Mapping {
         let size = rustix::fs::fstat(&fd)?.st_size;
         if u64::try_from(size).unwrap_or(0) < len as u64 {
             // Touching pages behind the end would be a SIGBUS.
-            return Err(io::Error::new(io::ErrorKind::InvalidInput, format!("{size} bytes, {len} are needed")));
+            return Err(io::Error::new(
+                io::ErrorKind::InvalidInput,
+                format!("{size} bytes, {len} are needed"),
+            ));
         }
         // SAFETY: a fresh mapping at an address of the kernel's choice; nothing else refers to it.
         let start = unsafe {

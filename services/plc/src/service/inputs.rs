@@ -35,7 +35,8 @@ impl InputSource {
         let stack = ctx.stack.clone();
         let mut first = 0usize;
         let mut out = Vec::new();
-        for service in stack.services.iter().filter(|s| s.wiring.plc.as_deref() == Some(ctx.service.as_str())) {
+        for service in stack.services.iter().filter(|s| s.wiring.plc.as_deref() == Some(ctx.service.as_str()))
+        {
             let lengths: Vec<u32> = service.wiring.inputs.iter().map(|r| r.bytes).collect();
             if lengths.is_empty() {
                 continue;

@@ -54,7 +54,10 @@ pub(super) enum Request {
     Answer(Value),
     Status,
     Keyframe,
-    Load { path: PathBuf, cold: bool },
+    Load {
+        path: PathBuf,
+        cold: bool,
+    },
 }
 
 /// Why a job fails: code of the result and text.
@@ -96,7 +99,8 @@ pub(super) fn parse(tail: &[u8], engine: &Engine) -> Result<Request, Refusal> {
             let path = text("var")?;
             let cell = engine.resolve(path).map_err(|e| fail(e.to_string()))?;
             let found = engine.forces().find(|(name, patch)| {
-                name.eq_ignore_ascii_case(path) || (patch.offset == cell.offset && u32::from(patch.len) == cell.bytes())
+                name.eq_ignore_ascii_case(path)
+                    || (patch.offset == cell.offset && u32::from(patch.len) == cell.bytes())
             });
             let Some((name, patch)) = found else { return Err(fail(format!("'{path}' is not forced"))) };
             Ok(Request::Order(Order::Unforce(*patch, name.to_owned())))
@@ -118,7 +122,8 @@ pub(super) fn parse(tail: &[u8], engine: &Engine) -> Result<Request, Refusal> {
 
 fn assignment(job: &Value, engine: &Engine) -> Result<(Patch, String), Refusal> {
     let fail = |text: String| (FAILED, text);
-    let path = job.get("var").and_then(Value::as_str).ok_or_else(|| fail("the job lacks \"var\"".to_owned()))?;
+    let path =
+        job.get("var").and_then(Value::as_str).ok_or_else(|| fail("the job lacks \"var\"".to_owned()))?;
     let value = job.get("value").ok_or_else(|| fail("the job lacks \"value\"".to_owned()))?;
     let cell = engine.resolve(path).map_err(|e| fail(e.to_string()))?;
     let patch = cell.patch(path, value).map_err(|e| fail(e.to_string()))?;
@@ -143,7 +148,9 @@ fn read(job: &Value, engine: &Engine) -> Result<Value, String> {
 }
 
 fn one(path: &str, engine: &Engine) -> Result<(Value, String), String> {
-    if let Some(array) = engine.map().and_then(|map| crate::engine::value::find(map, path)).filter(|s| !s.dims.is_empty()) {
+    if let Some(array) =
+        engine.map().and_then(|map| crate::engine::value::find(map, path)).filter(|s| !s.dims.is_empty())
+    {
         return Ok((elements(array, engine), format!("ARRAY OF {}", array.elem.name())));
     }
     let cell = engine.resolve(path).map_err(|e| e.to_string())?;
@@ -157,7 +164,8 @@ fn elements(array: &Symbol, engine: &Engine) -> Value {
     (0..count)
         .map(|i| {
             let offset = array.offset + i * step;
-            crate::engine::value::Cell { offset, elem: array.elem, storage: array.storage }.json(engine.memory())
+            crate::engine::value::Cell { offset, elem: array.elem, storage: array.storage }
+                .json(engine.memory())
         })
         .collect()
 }

@@ -1,5 +1,9 @@
 //! The loop: waits for clock, inputs and commands, runs scans, publishes what came out.
 
+mod asked;
+mod keyframes;
+mod tell;
+
 use super::acks::Acks;
 use super::inputs::InputSource;
 use super::jobs::{self, Asker, Order, Request};
@@ -196,7 +200,8 @@ impl Live {
     /// Leaves the module where the recorder finds it, and says that it is loaded.
     fn tell_loaded(&mut self, ctx: &mut Context) {
         let hash = self.engine.program_hash();
-        let mut detail = json!({ "program_hash": format!("{hash:016x}"), "files": self.engine.setup().files });
+        let mut detail =
+            json!({ "program_hash": format!("{hash:016x}"), "files": self.engine.setup().files });
         let Some(program) = self.engine.program().cloned() else {
             ctx.event(EventKind::Loaded, Level::Info, "no program: image and routes only", detail);
             return;
@@ -204,7 +209,9 @@ impl Live {
         let path = self.root.join(format!("{}.{hash:016x}.wasm", ctx.service));
         match std::fs::write(&path, &program.artifact.wasm) {
             Ok(()) => detail["artifact"] = json!(path),
-            Err(e) => tracing::warn!("the program cannot be left for the recorder in {}: {e}", path.display()),
+            Err(e) => {
+                tracing::warn!("the program cannot be left for the recorder in {}: {e}", path.display())
+            }
         }
         let tasks: Vec<&str> = program.artifact.map.tasks.iter().map(|t| t.name.as_str()).collect();
         detail["tasks"] = json!(tasks);
@@ -217,8 +224,10 @@ impl Live {
     /// Until the stack stops the service.
     pub(super) fn run(&mut self, ctx: &mut Context) -> Result<(), RunError> {
         let service = ctx.service.clone();
-        let system =
-            |what: &'static str| { let service = service.clone(); move |source| RunError::System { service, what, source } };
+        let system = |what: &'static str| {
+            let service = service.clone();
+            move |source| RunError::System { service, what, source }
+        };
         let mut reactor = Reactor::new().map_err(system("epoll"))?;
         let inbox = reactor.add(self.inbox.fd()).map_err(system("watching the inbox"))?;
         let stop = reactor.add(ctx.shutdown_fd()).map_err(system("watching for the end"))?;
@@ -298,8 +307,10 @@ impl Live {
                 return;
             }
             let Ok(body) = serde_json::from_slice::<EventBody>(tail) else { return };
-            if matches!(body.event, EventKind::Died | EventKind::Hung | EventKind::Restarting | EventKind::Held)
-                && let Some(source) = inputs.iter_mut().find(|s| s.name == body.service)
+            if matches!(
+                body.event,
+                EventKind::Died | EventKind::Hung | EventKind::Restarting | EventKind::Held
+            ) && let Some(source) = inputs.iter_mut().find(|s| s.name == body.service)
             {
                 source.died(body.t_ns);
             }
@@ -320,7 +331,8 @@ impl Live {
     fn next_due_ns(&self, now_ns: u64) -> u64 {
         let latest = now_ns + self.config.max_interval.ns();
         let running = self.engine.state() == PlcState::Run;
-        let task = self.engine.next_task_ns().filter(|_| running).map(|plc| (plc + self.base_ns).max(0) as u64);
+        let task =
+            self.engine.next_task_ns().filter(|_| running).map(|plc| (plc + self.base_ns).max(0) as u64);
         match (self.config.trigger, task) {
             (_, Some(task)) => task.clamp(now_ns.min(latest), latest),
             (Trigger::Inputs, None) => latest,
@@ -444,219 +456,6 @@ impl Live {
         let _ = self.image_port.send_tail(self.header, engine.image_bytes());
         self.image_port.ring();
         self.image_sent_ns = now_ns;
-    }
-
-    // --- what is not every scan's ---------------------------------------------------------------------
-
-    fn tell_orders(&mut self, ctx: &mut Context, before: PlcState) {
-        let orders = std::mem::take(&mut self.orders);
-        for (source, order) in &orders {
-            let by = ctx.stack.writer_name(source.writer);
-            match order {
-                Order::Start(kind) => {
-                    let message = format!("PLC started, {} start", kind.word());
-                    let detail = json!({ "start": kind, "by": by, "scan": self.engine.scan() });
-                    ctx.event(EventKind::PlcStarted, Level::Info, message, detail);
-                    ctx.set_state(HealthState::Ready);
-                    self.restart_at_ns = None;
-                }
-                Order::Stop if before == PlcState::Run => {
-                    let detail = json!({ "by": by, "scan": self.engine.scan() });
-                    ctx.event(EventKind::PlcStopped, Level::Warning, format!("PLC stopped by {by}"), detail);
-                }
-                Order::Force(patch, path) => {
-                    let text = self.engine.resolve(path).map_or_else(|_| "?".to_owned(), |c| c.text(self.engine.memory()));
-                    let detail = json!({ "var": path, "value": text, "by": by, "offset": patch.offset });
-                    ctx.event(EventKind::Forced, Level::Warning, format!("{path} forced to {text} by {by}"), detail);
-                }
-                Order::Unforce(_, path) => {
-                    let detail = json!({ "var": path, "by": by });
-                    ctx.event(EventKind::Forced, Level::Info, format!("{path} no longer forced, by {by}"), detail);
-                }
-                Order::UnforceAll => {
-                    ctx.event(EventKind::Forced, Level::Info, format!("nothing forced any more, by {by}"), json!({ "by": by }));
-                }
-                Order::Stop | Order::Set(..) | Order::Load(_) => {}
-            }
-        }
-        self.orders = orders;
-        self.orders.clear();
-        let now_ns = clock::mono_ns();
-        for i in 0..self.replies.len() {
-            let asker = self.replies[i];
-            let code = if now_ns > asker.deadline_ns { 2 } else { 0 };
-            self.reply(&asker, code, json!({ "ok": true }));
-        }
-        self.replies.clear();
-    }
-
-    fn tell_fault(&mut self, ctx: &mut Context, fault: &FaultReport, now_ns: u64) {
-        self.counters.faults += 1;
-        let mut detail = serde_json::to_value(fault).unwrap_or(Value::Null);
-        detail["scan"] = json!(self.engine.scan());
-        ctx.event(EventKind::ProgramFault, Level::Fault, format!("program fault: {}", fault.message), detail);
-        ctx.set_state(HealthState::Degraded);
-        self.keyframe_wanted = Some(Reason::Trap);
-        if restart_of(self.config.on_fault).is_some() {
-            self.restart_at_ns = Some(now_ns + RESTART_NS);
-        }
-    }
-
-    fn tell_quality(&mut self, ctx: &mut Context) {
-        for i in 0..self.inputs.len() {
-            let quality = self.inputs[i].quality(&self.engine);
-            let told = self.inputs[i].told.replace(quality);
-            if told == Some(quality) || (told.is_none() && quality == Quality::Good) {
-                continue;
-            }
-            let name = self.inputs[i].name.clone();
-            let (level, words) = match quality {
-                Quality::Good => (Level::Info, "good"),
-                Quality::Stale => (Level::Warning, "stale"),
-                Quality::NoData => (Level::Warning, "without data"),
-                Quality::OwnerDead => (Level::Warning, "bad: their service is dead or silent"),
-            };
-            let detail = json!({ "quality": quality, "was": told, "scan": self.engine.scan() });
-            ctx.event_about(&name, EventKind::InputQuality, level, format!("inputs of '{name}' are {words}"), detail);
-        }
-    }
-
-    fn take_jobs(&mut self, ctx: &mut Context) {
-        let mut taken: Vec<(Asker, Vec<u8>)> = Vec::new();
-        self.jobs.drain(16, |job, tail| {
-            let stamp = job.stamp;
-            let source = Source { writer: stamp.writer, generation: stamp.generation, seq: stamp.seq };
-            taken.push((Asker { source, deadline_ns: job.deadline_t_ns }, tail.to_vec()));
-        });
-        for (asker, tail) in taken {
-            self.counters.jobs += 1;
-            if clock::mono_ns() > asker.deadline_ns {
-                self.reply(&asker, 2, json!({ "error": "expired before it was read" }));
-                continue;
-            }
-            match jobs::parse(&tail, &self.engine) {
-                Ok(request) => self.take_request(ctx, asker, request),
-                Err((code, text)) => self.reply(&asker, code, json!({ "error": text })),
-            }
-        }
-    }
-
-    fn take_request(&mut self, ctx: &mut Context, asker: Asker, request: Request) {
-        match request {
-            Request::Order(order) => {
-                if self.orders.len() >= 64 {
-                    self.reply(&asker, 1, json!({ "error": "64 commands already wait for the next scan" }));
-                    return;
-                }
-                self.orders.push((asker.source, order));
-                self.replies.push(asker);
-                self.hurry = true;
-            }
-            Request::Answer(value) => self.reply(&asker, 0, json!({ "ok": value })),
-            Request::Status => {
-                let value = status(self, clock::mono_ns());
-                self.reply(&asker, 0, json!({ "ok": value }));
-            }
-            Request::Keyframe => {
-                self.keyframe_wanted.get_or_insert(Reason::Request);
-                self.reply(&asker, 0, json!({ "ok": true }));
-            }
-            Request::Load { path, cold } => {
-                if self.loading.is_some() {
-                    self.reply(&asker, 1, json!({ "error": "another program is being loaded" }));
-                    return;
-                }
-                tracing::info!("loading {} for {}", path.display(), ctx.stack.writer_name(asker.source.writer));
-                let started = Loading::start(asker, &self.runtime, self.engine.setup(), self.dir.clone(), path, cold);
-                match started {
-                    Ok(loading) => self.loading = Some(loading),
-                    Err(text) => self.reply(&asker, 1, json!({ "error": text })),
-                }
-            }
-        }
-    }
-
-    fn finish_load(&mut self, ctx: &mut Context) {
-        let Some(result) = self.loading.as_ref().and_then(Loading::poll) else { return };
-        let Some(loading) = self.loading.take() else { return };
-        let mut engine = match result {
-            Ok(engine) => engine,
-            Err(text) => {
-                self.reply(&loading.asker, 1, json!({ "error": format!("{}: {text}", loading.path.display()) }));
-                return;
-            }
-        };
-        engine.continue_from(&self.engine);
-        let layout = engine.retain_layout();
-        let kept = !loading.cold && layout == self.retain_layout && engine.set_retain(self.engine.retain());
-        let start = if kept { Start::Warm } else { Start::Cold };
-        if self.engine.forces().next().is_some() {
-            ctx.event(EventKind::Forced, Level::Info, "nothing forced any more: a new program", Value::Null);
-        }
-        let had_retain_file = self.disk.is_some();
-        self.engine = engine;
-        self.retain_layout = layout;
-        if !self.engine.retain().is_empty() && !had_retain_file {
-            tracing::warn!("the new program's RETAIN variables are copied to disk only after a restart of the service");
-        }
-        self.orders.clear();
-        self.orders.push((loading.asker.source, Order::Load(self.engine.program_hash())));
-        self.orders.push((loading.asker.source, Order::Start(start)));
-        self.replies.push(loading.asker);
-        self.keyframe_next = None;
-        self.engine.take_keyframe(Reason::Load);
-        self.keyframe_next = Some(0);
-        self.send_keyframe();
-        self.tell_loaded(ctx);
-        self.hurry = true;
-    }
-
-    fn reply(&mut self, asker: &Asker, code: u32, body: Value) {
-        let header = JobResult {
-            job_seq: asker.source.seq,
-            job_writer: asker.source.writer,
-            job_generation: asker.source.generation,
-            code,
-            ..JobResult::default()
-        };
-        let text = serde_json::to_vec(&body).unwrap_or_default();
-        let sent = if text.len() > self.results.max_tail() as usize {
-            let short = json!({ "error": "the answer is longer than 4096 bytes; ask for less at once" });
-            let header = JobResult { code: 1, ..header };
-            self.results.send_tail(header, &serde_json::to_vec(&short).unwrap_or_default())
-        } else {
-            self.results.send_tail(header, &text)
-        };
-        if let Err(e) = sent {
-            tracing::warn!("an answer was not sent: {e}");
-        }
-        self.results.ring();
-    }
-
-    /// Sends the next parts of a keyframe, or takes one that is wanted.
-    fn send_keyframe(&mut self) {
-        if self.keyframe_next.is_none() {
-            let Some(reason) = self.keyframe_wanted.take() else { return };
-            self.engine.take_keyframe(reason);
-            self.keyframe_next = Some(0);
-            self.keyframe_due_ns = clock::mono_ns() + KEYFRAME_NS;
-        }
-        let Some(next) = self.keyframe_next else { return };
-        let content = self.engine.keyframe();
-        let scan = Content::parse(&content[..content.len().min(ipc_types::scan_record::HEAD_BYTES)])
-            .map_or(0, |c| c.head.scan);
-        let all = parts(content);
-        let count = all.len();
-        for (i, part) in all.enumerate().skip(next).take(PARTS_PER_TURN) {
-            if self.keyframe_port.send_tail(part_header(scan, i, content.len()), part).is_err() {
-                self.counters.records_lost += 1;
-            }
-        }
-        self.keyframe_port.ring();
-        self.keyframe_next = (next + PARTS_PER_TURN < count).then_some(next + PARTS_PER_TURN);
-        if self.keyframe_next.is_none() {
-            self.counters.keyframes += 1;
-        }
     }
 
     fn tick(&mut self, ctx: &mut Context) {

@@ -35,9 +35,11 @@ impl Loading {
         std::thread::Builder::new()
             .name("load".to_owned())
             .spawn(move || {
-                let built = program::load(&dir, &[file], &setup).map_err(|e| e.to_string()).and_then(|compiled| {
-                    Engine::new(&runtime, Some(compiled.program), Arc::new(setup)).map_err(|e| e.to_string())
-                });
+                let built =
+                    program::load(&dir, &[file], &setup).map_err(|e| e.to_string()).and_then(|compiled| {
+                        Engine::new(&runtime, Some(compiled.program), Arc::new(setup))
+                            .map_err(|e| e.to_string())
+                    });
                 let _ = send.send(built);
             })
             .map_err(|e| format!("cannot start the thread that compiles: {e}"))?;
@@ -49,7 +51,9 @@ impl Loading {
         match self.done.try_recv() {
             Ok(result) => Some(result),
             Err(TryRecvError::Empty) => None,
-            Err(TryRecvError::Disconnected) => Some(Err("the thread that compiles ended without a result".to_owned())),
+            Err(TryRecvError::Disconnected) => {
+                Some(Err("the thread that compiles ended without a result".to_owned()))
+            }
         }
     }
 }

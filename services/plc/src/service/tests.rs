@@ -1,0 +1,127 @@
+use super::*;
+use ipc_types::wiring::{Area, ImageRange, OnBad};
+use serde_json::json;
+
+fn range(area: Area, byte: u32, bytes: u32, symbol: Option<&str>) -> ImageRange {
+    ImageRange {
+        area,
+        byte,
+        bit: None,
+        bytes,
+        type_name: None,
+        symbol: symbol.map(str::to_owned),
+        label: format!("id 123h at byte {byte}"),
+        key: "in[0].to".into(),
+        on_bad: OnBad::Hold,
+        status_byte: None,
+    }
+}
+
+/// A stack of a plc with this table and one field service with these ranges.
+fn stack(dir: &std::path::Path, ranges: Vec<ImageRange>) -> Stack {
+    let entry = |name: &str, kind: &str, index: u32, wiring: Wiring| ServiceEntry {
+        name: name.into(),
+        kind: kind.into(),
+        index,
+        config: serde_json::Value::Null,
+        wiring,
+    };
+    let field = Wiring { plc: Some("plc".into()), inputs: ranges, ..Wiring::default() };
+    Stack {
+        name: "test".into(),
+        file: dir.join("stack.toml"),
+        dir: dir.to_owned(),
+        text: String::new(),
+        build_id: String::new(),
+        root: dir.to_owned(),
+        prefix: String::new(),
+        services: vec![entry("io", "can-io", 1, field), entry("plc", "plc", 2, Wiring::default())],
+        topics: Vec::new(),
+    }
+}
+
+fn found(config: serde_json::Value, program: &str, ranges: Vec<ImageRange>) -> Vec<String> {
+    static NUMBER: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(0);
+    let n = NUMBER.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+    let dir = std::env::temp_dir().join(format!("dinrail-plc-check-{}-{n}", std::process::id()));
+    std::fs::create_dir_all(&dir).unwrap();
+    std::fs::write(dir.join("main.st"), program).unwrap();
+    let stack = stack(&dir, ranges);
+    let config: Config = serde_json::from_value(config).unwrap();
+    let findings = check(&config, &stack, &stack.services[1]);
+    std::fs::remove_dir_all(&dir).unwrap();
+    findings.iter().map(|f| format!("{}.{}: {}", f.service, f.key, f.message)).collect()
+}
+
+const GOOD: &str = "PROGRAM main VAR n AT %QW0 : UINT; END_VAR n := Level; END_PROGRAM";
+
+#[test]
+fn a_right_table_has_no_findings_and_symbols_are_globals() {
+    let level = range(Area::Input, 2, 2, Some("Level"));
+    assert_eq!(found(json!({ "program": ["main.st"], "cycle": "10ms" }), GOOD, vec![level]), [""; 0]);
+}
+
+#[test]
+fn mistakes_are_found_without_starting() {
+    let program = json!({ "program": ["main.st"] });
+    let level = || range(Area::Input, 2, 2, Some("Level"));
+    let table = [
+        (json!({ "trigger": "inputs", "cycle": "10ms" }), GOOD, vec![], "plc.cycle: cycle and trigger"),
+        (json!({ "cycle": "50us", "route": [] }), GOOD, vec![], "plc.cycle: a cycle of 50us is not possible"),
+        (json!({ "min_interval": "1s" }), GOOD, vec![], "plc.min_interval: min_interval 1s and max_interval 100ms"),
+        (json!({ "max_interval": "5s" }), GOOD, vec![], "plc.max_interval: max_interval 5s is longer than 1s"),
+        (json!({ "input_timeout": "50ms" }), GOOD, vec![], "plc.input_timeout: input_timeout 50ms is shorter"),
+        (json!({ "watchdog": "1us" }), GOOD, vec![], "plc.watchdog: a watchdog of 1us is not possible"),
+        (json!({ "input_bytes": "1MiB" }), GOOD, vec![], "plc.input_bytes: input_bytes = 1MiB is not possible"),
+        (json!({ "route": [{ "from": "%IW0", "to": "%IW2" }] }), GOOD, vec![], "plc.route[0]: '%IW2' lies in %I"),
+        (json!({}), GOOD, vec![], "plc.: neither program nor route"),
+        (program.clone(), GOOD, vec![], "plc.program: the program does not compile:\nerror["),
+        (program.clone(), GOOD, vec![range(Area::Input, 3, 2, Some("Level"))], "io.in[0].to: symbol 'Level': byte 3"),
+        (json!({ "input_bytes": 8 }), GOOD, vec![range(Area::Input, 7, 2, None)], "io.in[0].to: 'id 123h at byte 7' ends at byte 9"),
+        (
+            program.clone(),
+            "PROGRAM main VAR i AT %IB9 : USINT; END_VAR i := 1; END_PROGRAM",
+            vec![level()],
+            "plc.program: main.st:1:",
+        ),
+        (
+            json!({ "program": ["main.st"], "cycle": "10ms" }),
+            "PROGRAM p VAR n : INT; END_VAR n := 1; END_PROGRAM CONFIGURATION c RESOURCE r ON PLC TASK t(INTERVAL := T#10ms, PRIORITY := 0); PROGRAM i WITH t : p; END_RESOURCE END_CONFIGURATION",
+            vec![],
+            "plc.program: the program does not compile:\nerror[",
+        ),
+    ];
+    for (config, text, ranges, expected) in table {
+        let findings = found(config.clone(), text, ranges);
+        assert!(findings.iter().any(|f| f.starts_with(expected)), "{config}: expected {expected:?} in {findings:#?}");
+    }
+}
+
+#[test]
+fn what_it_needs_of_the_rail() {
+    let neighbours = Neighbours { name: "plc".into(), ..Neighbours::default() };
+    let config: Config = serde_json::from_value(json!({ "program": ["a.st"], "marker_bytes": "64KiB" })).unwrap();
+    let wiring = topics(&config, &neighbours);
+    let kinds: Vec<&str> = wiring.topics.iter().map(|t| t.kind.row().suffix).collect();
+    assert_eq!(kinds, ["image", "writes", "scan", "keyframe", "jobs", "results"]);
+    assert_eq!(wiring.topics[0].max_tail, 4096 + 4096 + 65536);
+    assert_eq!(wiring.retain_bytes as usize, MEMORY_BYTES);
+    assert_eq!(wiring.files, [("a.st".into(), "program[0]".to_owned())]);
+}
+
+#[test]
+fn unknown_keys_and_wrong_units_are_refused() {
+    for bad in [json!({ "cylce": "10ms" }), json!({ "cycle": 10 }), json!({ "on_fault": "restart" })] {
+        assert!(serde_json::from_value::<Config>(bad.clone()).is_err(), "{bad}");
+    }
+}
+
+#[test]
+fn the_watchdog_follows_the_fastest_task_within_limits() {
+    let config = Config::default();
+    for (shortest_ns, expected_ms) in
+        [(None, 100), (Some(1_000_000), 100), (Some(50_000_000), 500), (Some(1_000_000_000), 1000)]
+    {
+        assert_eq!(watchdog_limit(&config, shortest_ns), Duration::from_millis(expected_ms));
+    }
+}

@@ -76,7 +76,9 @@ pub(crate) fn common<'a>(a: &'a Engine, b: &'a Engine) -> Vec<(&'a Symbol, u32)>
     map_a
         .symbols
         .iter()
-        .filter_map(|s| by_path.get(&s.path.to_ascii_lowercase()).filter(|o| alike(s, o)).map(|o| (s, o.offset)))
+        .filter_map(|s| {
+            by_path.get(&s.path.to_ascii_lowercase()).filter(|o| alike(s, o)).map(|o| (s, o.offset))
+        })
         .collect()
 }
 

@@ -192,7 +192,11 @@ proptest! {
 }
 
 /// Position of a section's body in the record of a scan.
-fn find(recording: &Recording, scan: u64, matches: impl Fn(&Section<'_>) -> Option<*const u8>) -> (usize, usize) {
+fn find(
+    recording: &Recording,
+    scan: u64,
+    matches: impl Fn(&Section<'_>) -> Option<*const u8>,
+) -> (usize, usize) {
     let (index, bytes) = recording
         .iter()
         .enumerate()
@@ -257,7 +261,9 @@ fn a_changed_stamp_is_named() {
 #[test]
 fn a_changed_constant_is_named() {
     let recording = record(&plain(40), 100);
-    for (from, to, variable) in [("setpoint + 3", "setpoint + 4", "main.speed"), ("* 0.25", "* 0.5", "main.sum")] {
+    for (from, to, variable) in
+        [("setpoint + 3", "setpoint + 4", "main.speed"), ("* 0.25", "* 0.5", "main.sum")]
+    {
         let report = verify_with(&recording, Some(&PROGRAM.replace(from, to)));
         assert_eq!(report.exit_code(), 1);
         let difference = report.first_difference.unwrap();
@@ -282,7 +288,10 @@ fn any_flipped_bit_of_a_record_is_caught_or_changes_nothing_that_counts() {
             if report.exit_code() == 0 {
                 // Who sent it, and names: information, no input of the scan.
                 let content = Content::parse(&mutated[index].1).unwrap();
-                assert_eq!(content.head.memory_hash, Content::parse(&recording[index].1).unwrap().head.memory_hash);
+                assert_eq!(
+                    content.head.memory_hash,
+                    Content::parse(&recording[index].1).unwrap().head.memory_hash
+                );
             }
         }
     }

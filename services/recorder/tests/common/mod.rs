@@ -50,7 +50,7 @@ impl Drop for TempDir {
 }
 
 pub fn wait_for(what: &str, mut condition: impl FnMut() -> bool) {
-    let limit = Instant::now() + Duration::from_secs(60);
+    let limit = Instant::now() + Duration::from_mins(1);
     while !condition() {
         assert!(Instant::now() < limit, "waited 60 s for {what}");
         std::thread::sleep(Duration::from_millis(5));
@@ -209,7 +209,7 @@ impl Rig {
         self.hand_over(batch);
     }
 
-    fn take(&self) -> Box<Batch> {
+    fn take(&self) -> Batch {
         let mut taken = None;
         wait_for("a free buffer", || {
             taken = self.shared.pool.take();
@@ -218,7 +218,7 @@ impl Rig {
         taken.unwrap()
     }
 
-    fn hand_over(&self, mut batch: Box<Batch>) {
+    fn hand_over(&self, mut batch: Batch) {
         batch.counters.copy_from_slice(&self.counters);
         batch.utc_offset_ns = self.utc_offset_ns;
         assert!(self.to_writer.send(ToWriter::Batch(batch)).is_ok());

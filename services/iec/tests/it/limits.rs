@@ -1,0 +1,127 @@
+//! Every limit holds, is told, and is not reached by accident.
+
+use dinrail_iec::{Options, Source, compile, limits};
+
+use crate::host::{Host, source};
+
+/// Codes of the errors.
+fn errors(text: &str) -> Vec<&'static str> {
+    match compile(&source(text), &Options::default()) {
+        Ok(_) => Vec::new(),
+        Err(d) => {
+            assert!(!d.render(false).is_empty());
+            let mut codes: Vec<_> = d.items().iter().map(|d| d.code).collect();
+            codes.dedup();
+            codes
+        }
+    }
+}
+
+fn program(vars: &str, body: &str) -> String {
+    format!("PROGRAM p VAR {vars} END_VAR {body} END_PROGRAM")
+}
+
+#[test]
+fn nesting() {
+    let parens = |n: usize| program("x : INT;", &format!("x := {}x{};", "(".repeat(n), ")".repeat(n)));
+    assert!(errors(&parens(30)).is_empty());
+    assert!(errors(&parens(10_000)).contains(&"E0801"));
+    let ifs = |n: usize| program("x : INT;", &format!("{}x := 1;{}", "IF x > 0 THEN ".repeat(n), " END_IF;".repeat(n)));
+    assert!(errors(&ifs(40)).is_empty());
+    assert!(errors(&ifs(10_000)).contains(&"E0801"));
+    let nots = program("b : BOOL;", &format!("b := {} b;", "NOT ".repeat(10_000)));
+    assert!(errors(&nots).contains(&"E0801"));
+    let comments = format!("{}{}PROGRAM p END_PROGRAM", "(*".repeat(60), "*)".repeat(60));
+    assert!(errors(&comments).is_empty());
+    let comments = format!("{}{}PROGRAM p END_PROGRAM", "(*".repeat(100), "*)".repeat(100));
+    assert!(errors(&comments).contains(&"E0801"));
+    let arrays = program(&format!("a : {} INT;", "ARRAY [0..0] OF ".repeat(1000)), "");
+    assert!(errors(&arrays).contains(&"E0801"));
+    let path = program("a : INT;", &format!("a{} := 1;", ".b".repeat(1000)));
+    assert!(errors(&path).contains(&"E0801"));
+}
+
+/// A long chain is fine up to the limit and runs on a small stack.
+#[test]
+fn long_expressions_on_a_small_stack() {
+    let chain = |n: usize| program("x, y : DINT;", &format!("y := x{};", " + 1".repeat(n)));
+    let run = move || {
+        let mut h = Host::new(&chain(limits::OPERATORS));
+        h.run();
+        assert_eq!(h.int("y"), limits::OPERATORS as i128);
+        assert_eq!(errors(&chain(limits::OPERATORS + 1)), ["E0801"]);
+        let mixed = program("x : DINT;", &format!("x := {}1{};", "(x + ".repeat(60), ")".repeat(60)));
+        assert!(errors(&mixed).iter().all(|c| *c == "E0801"));
+    };
+    std::thread::Builder::new().stack_size(1 << 20).spawn(run).unwrap().join().unwrap();
+}
+
+#[test]
+fn sizes() {
+    assert!(errors(&program("a : ARRAY [0..4000000] OF BYTE;", "")).is_empty());
+    assert_eq!(errors(&program("a : ARRAY [0..5000000] OF BYTE;", "")), ["E0805"]);
+    assert_eq!(errors(&program("a, b, c, d, e : ARRAY [0..4000000] OF BYTE;", "")), ["E0805"]);
+    assert_eq!(errors(&program("a : ARRAY [0..2147483647, 0..2147483647] OF BYTE;", "")), ["E0805"]);
+    assert_eq!(errors(&program("a : ARRAY [0..9223372036854775807] OF BYTE;", "")), ["E0407"]);
+    let nested = "TYPE a : ARRAY [0..999] OF INT; b : ARRAY [0..999] OF a; c : ARRAY [0..999] OF b; END_TYPE PROGRAM p VAR x : c; END_VAR END_PROGRAM";
+    assert_eq!(errors(nested), ["E0805"]);
+    let blocks = "FUNCTION_BLOCK f VAR x : ARRAY [0..999999] OF LINT; END_VAR END_FUNCTION_BLOCK FUNCTION_BLOCK g VAR a, b, c : f; END_VAR END_FUNCTION_BLOCK PROGRAM p VAR x : g; END_VAR END_PROGRAM";
+    assert!(errors(blocks).contains(&"E0805"));
+}
+
+#[test]
+fn counts() {
+    let symbols = "FUNCTION_BLOCK f VAR a, b, c, d, e : BOOL; END_VAR END_FUNCTION_BLOCK PROGRAM p VAR x : ARRAY [0..99999] OF f; END_VAR END_PROGRAM";
+    assert_eq!(errors(symbols), ["E0803"]);
+    let many: Vec<String> = (0..limits::VARIABLES + 1).map(|i| format!("v{i}")).collect();
+    assert_eq!(errors(&program(&format!("{} : BOOL;", many.join(", ")), "")), ["E0803"]);
+    let mut chain = String::from("FUNCTION_BLOCK f0 VAR x : INT; END_VAR END_FUNCTION_BLOCK ");
+    for i in 1..100 {
+        chain.push_str(&format!("FUNCTION_BLOCK f{i} VAR x : f{}; END_VAR END_FUNCTION_BLOCK ", i - 1));
+    }
+    // Given callee first, each is complete when the next one asks.
+    assert!(errors(&format!("{chain} PROGRAM p END_PROGRAM")).is_empty());
+    let mut chain = String::new();
+    for i in 0..100 {
+        chain.push_str(&format!("FUNCTION_BLOCK f{i} VAR x : f{}; END_VAR END_FUNCTION_BLOCK ", i + 1));
+    }
+    chain.push_str("FUNCTION_BLOCK f100 VAR x : INT; END_VAR END_FUNCTION_BLOCK ");
+    assert!(errors(&format!("{chain} PROGRAM p END_PROGRAM")).contains(&"E0801"));
+    let tasks: Vec<String> = (0..100).map(|i| format!("TASK t{i}(PRIORITY := 1);")).collect();
+    let config = format!("PROGRAM p END_PROGRAM CONFIGURATION c RESOURCE r ON x {} PROGRAM i WITH t0 : p; END_RESOURCE END_CONFIGURATION", tasks.join(" "));
+    assert_eq!(errors(&config), ["E0803"]);
+}
+
+#[test]
+fn sources() {
+    assert_eq!(compile(&[], &Options::default()).unwrap_err().items()[0].code, "E0807");
+    let big = Source { name: "big.st".to_owned(), text: " ".repeat(limits::SOURCE_BYTES + 1) };
+    let d = compile(&[big], &Options::default()).unwrap_err();
+    assert_eq!(d.items()[0].code, "E0807");
+    assert!(d.render(false).contains("big.st"));
+    // The largest file of statements, and the most errors.
+    let mut text = String::from("PROGRAM p VAR x : INT; END_VAR ");
+    while text.len() < limits::SOURCE_BYTES - 100 {
+        text.push_str("x:=x+1;");
+    }
+    text.push_str(" END_PROGRAM");
+    let t = std::time::Instant::now();
+    assert!(errors(&text).is_empty());
+    println!("1 MiB of statements: {} ms", t.elapsed().as_millis());
+    let mut text = String::from("PROGRAM p ");
+    while text.len() < 200_000 {
+        text.push_str("x := ; ) ( ] ");
+    }
+    let d = compile(&source(&text), &Options::default()).unwrap_err();
+    assert!(d.items().len() <= limits::ERRORS_PER_FILE + 10, "{}", d.items().len());
+}
+
+#[test]
+fn retain_has_its_own_limit() {
+    let text = program("x : INT; END_VAR VAR RETAIN r : ARRAY [0..9] OF DINT;", "");
+    let options = Options { retain_max: 39, ..Options::default() };
+    let d = compile(&source(&text), &options).unwrap_err();
+    assert_eq!(d.items()[0].code, "E0806");
+    assert!(d.render(false).contains("40 bytes"));
+    assert!(compile(&source(&text), &Options { retain_max: 40, ..options }).is_ok());
+}
