@@ -234,13 +234,24 @@ impl Patch {
 pub enum Command<'a> {
     Stop,
     Start(Start),
-    Force { patch: Patch, path: &'a str },
-    Unforce { patch: Patch, path: &'a str },
+    Force {
+        patch: Patch,
+        path: &'a str,
+    },
+    Unforce {
+        patch: Patch,
+        path: &'a str,
+    },
     UnforceAll,
     /// A variable is set once.
-    Set { patch: Patch, path: &'a str },
+    Set {
+        patch: Patch,
+        path: &'a str,
+    },
     /// A program was loaded before this scan; a keyframe precedes it.
-    Load { program_hash: u64 },
+    Load {
+        program_hash: u64,
+    },
 }
 
 /// What stopped a task.

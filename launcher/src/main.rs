@@ -1,22 +1,5 @@
-//! `dinrail`: starts a stack of gateway services, keeps it alive, and is every command around it.
-//!
-//! [`stackfile`] reads and checks stack files, [`supervise`] runs them, [`kinds`] knows the services of this
-//! build, [`stacks`] the ready stacks inside the executable, [`commands`] is one module a command.
-//!
-//! Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done but with data loss. Results go to stdout, diagnostics to
-//! stderr.
+//! `dinrail`, the executable; everything it does is in the library beside it.
 
-mod cli;
-mod commands;
-mod explain_keys;
-mod kinds;
-mod stackfile;
-mod stacks;
-mod supervise;
-
-use clap::Parser;
-use std::process::ExitCode;
-
-fn main() -> ExitCode {
-    commands::run(cli::Cli::parse())
+fn main() -> std::process::ExitCode {
+    dinrail_launcher::main()
 }

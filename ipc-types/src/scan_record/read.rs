@@ -13,23 +13,41 @@ pub struct Content<'a> {
 /// One section.
 #[derive(Debug, Clone)]
 pub enum Section<'a> {
-    Control { source: Source, command: Command<'a> },
+    Control {
+        source: Source,
+        command: Command<'a>,
+    },
     /// A message of an input's owner: the ranges that changed.
-    Input { source: Source, ranges: InputRanges<'a> },
+    Input {
+        source: Source,
+        ranges: InputRanges<'a>,
+    },
     /// A write request: applied iff `result` is 0.
-    Write { source: Source, result: u32, tail: &'a [u8] },
+    Write {
+        source: Source,
+        result: u32,
+        tail: &'a [u8],
+    },
     /// The force table after a change of it, whole.
     Forces(Vec<Patch>),
-    Skipped { task: u16, periods: u64 },
+    Skipped {
+        task: u16,
+        periods: u64,
+    },
     Fault(Fault<'a>),
     Changes(Changes<'a>),
     Setup(&'a [u8]),
-    Memory { offset: u32, bytes: &'a [u8] },
+    Memory {
+        offset: u32,
+        bytes: &'a [u8],
+    },
     Field(&'a [u8]),
     Schedule(TaskState),
     Quality(&'a [u8]),
     /// Of a later version; to be skipped.
-    Unknown { tag: u8 },
+    Unknown {
+        tag: u8,
+    },
 }
 
 impl<'a> Content<'a> {
@@ -79,7 +97,7 @@ impl<'a> Iterator for Sections<'a> {
 }
 
 /// `(range, quality, first byte within the range, bytes)` of an INPUT section.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct InputRanges<'a>(&'a [u8]);
 
 impl<'a> Iterator for InputRanges<'a> {
@@ -96,7 +114,7 @@ impl<'a> Iterator for InputRanges<'a> {
 }
 
 /// `(offset, bytes after the scan)` of a CHANGES section, rising.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct Changes<'a>(&'a [u8]);
 
 impl<'a> Iterator for Changes<'a> {
@@ -164,10 +182,12 @@ fn section(bytes: &[u8], at: usize) -> Result<(Section<'_>, usize), RecordError>
 
 fn decode(tag: u8, a: u8, b: u16, body: &[u8]) -> Option<Section<'_>> {
     Some(match tag {
-        tag::CONTROL => Section::Control { source: source(body)?, command: command(a, b, &body[SOURCE_BYTES..])? },
+        tag::CONTROL => {
+            Section::Control { source: source(body)?, command: command(a, b, &body[SOURCE_BYTES..])? }
+        }
         tag::INPUT => {
             let ranges = InputRanges(body.get(SOURCE_BYTES..)?);
-            let used: usize = ranges.map(|(_, _, _, bytes)| 12 + bytes.len()).sum();
+            let used: usize = ranges.clone().map(|(_, _, _, bytes)| 12 + bytes.len()).sum();
             if used != ranges.0.len() {
                 return None;
             }
@@ -194,7 +214,7 @@ fn decode(tag: u8, a: u8, b: u16, body: &[u8]) -> Option<Section<'_>> {
         }),
         tag::CHANGES => {
             let changes = Changes(body);
-            let used: usize = changes.map(|(_, bytes)| 6 + bytes.len()).sum();
+            let used: usize = changes.clone().map(|(_, bytes)| 6 + bytes.len()).sum();
             if used != body.len() {
                 return None;
             }

@@ -22,7 +22,8 @@ fn example(writer: &mut Writer, input: &[u8], op: &[u8]) -> Vec<u8> {
     writer.change(260, &[1, 2, 3]);
     writer.change(4096, &[9]);
     writer.changes_end(at);
-    let head = Head { scan: 12, plc_time_ns: -5, memory_hash: 99, start: Start::Warm as u8, ..Head::default() };
+    let head =
+        Head { scan: 12, plc_time_ns: -5, memory_hash: 99, start: Start::Warm as u8, ..Head::default() };
     writer.finish(&head).to_vec()
 }
 
@@ -88,7 +89,14 @@ fn an_empty_list_of_changes_takes_no_room() {
     assert_eq!(writer.finish(&Head::default()).len(), HEAD_BYTES);
 }
 
-fn send(joiner: &mut Joiner, seq: &mut u64, generation: u32, scan: u64, content: &[u8], skip: &[usize]) -> (u32, u32) {
+fn send(
+    joiner: &mut Joiner,
+    seq: &mut u64,
+    generation: u32,
+    scan: u64,
+    content: &[u8],
+    skip: &[usize],
+) -> (u32, u32) {
     let (mut gaps, mut wholes) = (0, 0);
     for (i, part) in parts(content).enumerate() {
         let mut header = part_header(scan, i, content.len());

@@ -20,10 +20,13 @@ mod stats;
 use super::{print, println, table};
 use anyhow::Context as _;
 use clap::{Args, ValueEnum};
-use machine::Machine;
+use machine::{Machine, MachineMeter};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::process::{Command, ExitCode, Stdio};
+
+/// CPU of other processes, in per cent of one CPU, from which a report says that the machine was busy.
+const BUSY_PERCENT: f64 = 10.0;
 
 /// Arguments of `dinrail bench`.
 #[derive(Debug, Clone, Args)]
@@ -206,7 +209,14 @@ fn one(args: &BenchArgs) -> anyhow::Result<Report> {
         What::Idle => idle::run,
         What::All => anyhow::bail!("'all' is no bench of its own"),
     };
+    let meter = MachineMeter::start();
     measure(&mut bench).with_context(|| format!("bench {} could not be run", args.what.name()))?;
+    let others = meter.others();
+    if others >= BUSY_PERCENT {
+        bench.note(format!(
+            "other processes took {others:.0} % of a CPU meanwhile; a quiet machine gives better figures"
+        ));
+    }
     Ok(Report { machine, figures: bench.figures, notes: bench.notes })
 }
 

@@ -100,9 +100,14 @@ impl std::error::Error for LoadError {}
 pub fn load(path: &Path) -> Result<Loaded, LoadError> {
     let path = if path.is_dir() { path.join(FILE_NAME) } else { path.to_owned() };
     let text = read_file(&path).map_err(|(message, help)| LoadError::of_file(&path, message, help))?;
-    let full = path.canonicalize().unwrap_or_else(|_| path.clone());
+    load_text(&path, &text)
+}
+
+/// Loads a text as if it stood in the stack file `path`, which need not be there.
+pub fn load_text(path: &Path, text: &str) -> Result<Loaded, LoadError> {
+    let full = path.canonicalize().unwrap_or_else(|_| path.to_owned());
     let dir = full.parent().unwrap_or(Path::new("/")).to_owned();
-    Loader::new(&path, &full, &dir).load(&text)
+    Loader::new(path, &full, &dir).load(text)
 }
 
 fn read_file(path: &Path) -> Result<String, (String, &'static str)> {

@@ -4,7 +4,7 @@
 //! |---|---|
 //! | [`policy`] | when to start, kill, restart, hold: sans-I/O |
 //! | [`supervisor`] | the loop that does what the policy decides |
-//! | [`rail_thread`], [`watch`] | the launcher's place on the rail, in a thread of its own |
+//! | [`rail_thread`], [`outbox`], [`watch`] | the launcher's place on the rail, in a thread of its own |
 //! | [`ground`], [`state_dir`] | shared memory, listeners, RETAIN memory, the lock of a running stack |
 //! | [`child`], [`service_main`] | a process, seen from the launcher and from within |
 //! | [`debris`] | what processes leave that are killed while they start |
@@ -24,6 +24,7 @@ pub mod hardware;
 pub mod inject;
 pub mod logbook;
 pub mod notify;
+pub mod outbox;
 pub mod policy;
 pub mod rail_thread;
 pub mod report;

@@ -3,6 +3,7 @@
 //! All of it lives in one helper thread, because a call into the middleware may hang on what a killed process
 //! left. The main thread talks to it through channels and an eventfd, counts its turns, and never waits for it.
 
+use super::outbox::Outbox;
 use super::watch::{Observed, Observer};
 use ipc_types::context::Context;
 use ipc_types::event::{EventBody, EventKind, Level};
@@ -10,24 +11,19 @@ use ipc_types::payload::{Event, Health, HealthState};
 use ipc_types::port::{Publisher, Subscriber};
 use ipc_types::rail::{self, Held, RailError};
 use ipc_types::reactor::Reactor;
-use ipc_types::stack::ServiceEntry;
 use ipc_types::topic::{EVENTS, TopicKind};
 use ipc_types::{Stack, clock};
 use rustix::event::{EventfdFlags, eventfd};
 use serde_json::Value;
-use std::collections::VecDeque;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// Heartbeats and orders are looked at so often.
 const TURN: Duration = Duration::from_millis(20);
 /// Orders that may wait.
 const ORDERS_MAX: usize = 1024;
-/// Events that wait for a recorder, and how long at most.
-const WAITING_MAX: usize = 256;
-const WAITING_LIMIT: Duration = Duration::from_secs(10);
 /// Longest message of an event in bytes.
 const EVENT_MESSAGE_MAX: usize = 1024;
 
@@ -152,7 +148,8 @@ fn serve(
     // The launcher is writer 0 of the rail.
     ctx.service = "launcher".to_owned();
     ctx.writer = 0;
-    let mut post = Post::new(ctx.publisher::<Event>(EVENTS)?, stack);
+    let mut post = Post { events: ctx.publisher::<Event>(EVENTS)?, told: false };
+    let mut outbox = Outbox::new(stack);
     let mut pulses = Vec::with_capacity(stack.services.len());
     for service in &stack.services {
         let health = ctx.subscriber::<Health>(&TopicKind::Health.of(&service.name))?;
@@ -171,10 +168,10 @@ fn serve(
         for order in orders.try_iter() {
             match order {
                 Order::Tell { service, kind, level, message, detail } => {
-                    post.take(EventBody::now(kind, level, &service, message, detail));
+                    outbox.take(EventBody::now(kind, level, &service, message, detail));
                 }
                 Order::Quit => {
-                    post.send_all();
+                    post.send(outbox.rest());
                     // What services said last, the recorder above all.
                     let observed = observer.look(true).map(Box::new);
                     out.send(Report::Turn { t_ns: clock::mono_ns(), beats: Vec::new(), observed });
@@ -190,8 +187,7 @@ fn serve(
                 }
             });
         }
-        post.turn(&beats);
-        if let Some(trouble) = post.trouble.take() {
+        if let Some(trouble) = post.send(outbox.due(&beats, clock::mono_ns())) {
             out.send(Report::Trouble(trouble));
         }
         let observed = observer.look(false).map(Box::new);
@@ -199,90 +195,24 @@ fn serve(
     }
 }
 
-/// A recorder, as far as events are concerned.
-struct Listening {
-    service: usize,
-    name: String,
-    /// Its generation from which on it counts.
-    from: u32,
-    ready: bool,
-}
-
-/// Events on their way to the rail. They wait while a recorder is not ready, so that its own death and the start of
-/// the stack are in the recording; their stamps are those of when they happened.
+/// Publishes what may go now.
 struct Post {
     events: Publisher<Event>,
-    recorders: Vec<Listening>,
-    waiting: VecDeque<EventBody>,
-    since: Option<Instant>,
     told: bool,
-    trouble: Option<String>,
 }
 
 impl Post {
-    fn new(events: Publisher<Event>, stack: &Stack) -> Self {
-        let recorders = stack.services.iter().enumerate().filter(|(_, s)| s.wiring.records);
-        let listening = |(service, entry): (usize, &ServiceEntry)| Listening {
-            service,
-            name: entry.name.clone(),
-            from: 1,
-            ready: false,
-        };
-        Self {
-            events,
-            recorders: recorders.map(listening).collect(),
-            waiting: VecDeque::new(),
-            since: None,
-            told: false,
-            trouble: None,
-        }
-    }
-
-    fn take(&mut self, body: EventBody) {
-        if let Some(recorder) = self.recorders.iter_mut().find(|r| r.name == body.service)
-            && body.event == EventKind::Died
-        {
-            let generation = body.detail.get("generation").and_then(Value::as_u64).unwrap_or(0);
-            recorder.from = generation as u32 + 1;
-            recorder.ready = false;
-        }
-        self.waiting.push_back(body);
-        self.since.get_or_insert_with(Instant::now);
-        if self.waiting.len() > WAITING_MAX {
-            self.send_first();
-        }
-        self.send_if_heard();
-    }
-
-    fn turn(&mut self, beats: &[Beat]) {
-        for beat in beats.iter().filter(|b| matches!(b.state, HealthState::Ready | HealthState::Degraded)) {
-            for recorder in self.recorders.iter_mut().filter(|r| r.service == beat.service) {
-                recorder.ready |= beat.generation >= recorder.from;
+    /// The first failure is returned as text, the others are silent.
+    fn send(&mut self, bodies: Vec<EventBody>) -> Option<String> {
+        let mut trouble = None;
+        for body in bodies {
+            if let Err(e) = publish(&mut self.events, body)
+                && !std::mem::replace(&mut self.told, true)
+            {
+                trouble = Some(format!("an event could not be published: {e}"));
             }
         }
-        self.send_if_heard();
-    }
-
-    fn send_if_heard(&mut self) {
-        if self.recorders.iter().all(|r| r.ready) || self.since.is_some_and(|t| t.elapsed() > WAITING_LIMIT) {
-            self.send_all();
-        }
-    }
-
-    fn send_all(&mut self) {
-        while !self.waiting.is_empty() {
-            self.send_first();
-        }
-        self.since = None;
-    }
-
-    fn send_first(&mut self) {
-        let Some(body) = self.waiting.pop_front() else { return };
-        if let Err(e) = publish(&mut self.events, body)
-            && !std::mem::replace(&mut self.told, true)
-        {
-            self.trouble = Some(format!("an event could not be published: {e}"));
-        }
+        trouble
     }
 }
 

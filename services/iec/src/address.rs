@@ -1,9 +1,18 @@
-//! `%`-addresses: one reader for sources, stack files, routes and `dinrail map`.
+//! `%`-addresses: one reader and one writer for sources, stack files, routes, register maps and `dinrail map`.
 
 use crate::artifact::AreaKind;
+use serde::{Deserialize, Serialize};
+
+/// Elements of each of OpenPLC's tables; of the bit table, bytes.
+pub const OPENPLC_ELEMENTS: u32 = 1024;
+/// Largest area.
+const AREA_BYTES: u64 = 65_536;
+/// Characters of a wrong address that a message shows.
+const SHOWN: usize = 40;
 
 /// How the number in `%IW2` counts.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Addressing {
     /// In elements of the named size, as CODESYS V3: `%IW1` = bytes 2-3, `%IX3.1` = bit 1 of byte 3.
     #[default]
@@ -14,6 +23,36 @@ pub enum Addressing {
     /// not overlap. Here they lie behind each other in the area: `%xX` in bytes 0-1023, `%xW` 1024-3071, `%xB`
     /// 3072-4095, `%xD` 4096-8191, `%xL` 8192-16383 (so `%xD` and `%xL` need an area larger than the default).
     OpenPlc,
+}
+
+impl Addressing {
+    /// Name as in the stack file.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Element => "element",
+            Self::Byte => "byte",
+            Self::OpenPlc => "openplc",
+        }
+    }
+    /// From the name in the stack file.
+    pub fn from_name(name: &str) -> Option<Self> {
+        [Self::Element, Self::Byte, Self::OpenPlc].into_iter().find(|a| a.name() == name)
+    }
+    /// First byte of the values of a size: 0 but for OpenPLC's tables.
+    pub const fn base(self, size: AddressSize) -> u32 {
+        match self {
+            Self::Element | Self::Byte => 0,
+            Self::OpenPlc => size.openplc_base(),
+        }
+    }
+    /// Bytes that the values of a size may take in an area of `area_bytes`, from [`Addressing::base`] on.
+    pub fn room(self, size: AddressSize, area_bytes: u32) -> u32 {
+        let room = area_bytes.saturating_sub(self.base(size));
+        match self {
+            Self::Element | Self::Byte => room,
+            Self::OpenPlc => room.min(OPENPLC_ELEMENTS * size.bytes()),
+        }
+    }
 }
 
 /// Size letter of an address.
@@ -41,8 +80,15 @@ impl AddressSize {
             Self::Lword => 8,
         }
     }
+    /// 1, 8, 16, 32 or 64.
+    pub const fn bits(self) -> u32 {
+        match self {
+            Self::Bit => 1,
+            _ => self.bytes() * 8,
+        }
+    }
     /// First byte of this size's own table with [`Addressing::OpenPlc`].
-    const fn openplc_base(self) -> u64 {
+    const fn openplc_base(self) -> u32 {
         match self {
             Self::Bit => 0,
             Self::Word => 1024,
@@ -75,10 +121,52 @@ pub struct LocatedAddress {
     pub size: AddressSize,
 }
 
+impl LocatedAddress {
+    /// The place of one bit, or of `bytes` bytes. `area` is `I`, `Q` or `M`. `None` when no address has this form.
+    pub fn new(area: char, byte: u32, bit: Option<u8>, bytes: u32) -> Option<Self> {
+        let area = match area {
+            'I' => AreaKind::Input,
+            'Q' => AreaKind::Output,
+            'M' => AreaKind::Marker,
+            _ => return None,
+        };
+        let size = match (bit, bytes) {
+            (Some(0..=7), _) => AddressSize::Bit,
+            (None, 1) => AddressSize::Byte,
+            (None, 2) => AddressSize::Word,
+            (None, 4) => AddressSize::Dword,
+            (None, 8) => AddressSize::Lword,
+            _ => return None,
+        };
+        (u64::from(byte) + u64::from(size.bytes()) <= AREA_BYTES).then_some(Self { area, byte, bit, size })
+    }
+
+    /// The text that [`parse_address`] reads as this place. `None` when this way to count has no number for it:
+    /// a value that does not begin at a multiple of its size, or lies outside OpenPLC's table of its size.
+    pub fn text(self, addressing: Addressing) -> Option<String> {
+        let (area, letter) = (area_letter(self.area), self.size.letter());
+        let unit = match addressing {
+            Addressing::Byte => 1,
+            Addressing::Element | Addressing::OpenPlc => self.size.bytes(),
+        };
+        let from_base = self.byte.checked_sub(addressing.base(self.size))?;
+        let number = from_base.is_multiple_of(unit).then_some(from_base / unit)?;
+        if addressing == Addressing::OpenPlc && number >= OPENPLC_ELEMENTS {
+            return None;
+        }
+        Some(match self.bit {
+            Some(bit) => format!("%{area}{letter}{number}.{bit}"),
+            None => format!("%{area}{letter}{number}"),
+        })
+    }
+}
+
 /// Why a text is no address.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum AddressError {
-    #[error("`{text}` is not an address: write %I, %Q or %M, a size X, B, W, D or L, and a number, like %IX0.3 or %QW2")]
+    #[error(
+        "`{text}` is not an address: write %I, %Q or %M, a size X, B, W, D or L, and a number, like %IX0.3 or %QW2"
+    )]
     Form { text: String },
     #[error("`{text}`: a byte has the bits 0 to 7; bit {bit} of byte {byte} is {meant}")]
     Bit { text: String, byte: u32, bit: u32, meant: String },
@@ -86,20 +174,22 @@ pub enum AddressError {
     BareBit { text: String, meant: String },
     #[error("`{text}`: addresses of this size have no bit; the bit you may mean is {meant}")]
     BitOfWord { text: String, meant: String },
-    #[error("`{text}`: without a size letter only a bit is meant, like %IX0.0 (`addressing = \"byte\"` also takes %I0.0)")]
+    #[error(
+        "`{text}`: without a size letter only a bit is meant, like %IX0.0 (`addressing = \"byte\"` also takes %I0.0)"
+    )]
     NoSize { text: String },
     #[error("`{text}` is an incomplete address (`*`): VAR_CONFIG is not supported, write the address")]
     Incomplete { text: String },
     #[error("`{text}`: the number is too large, an area has at most 65536 bytes")]
     TooLarge { text: String },
-    #[error("`{text}`: OpenPLC's tables have 1024 elements, 0 to 1023")]
+    #[error("`{text}`: OpenPLC's tables have {OPENPLC_ELEMENTS} elements, 0 to {}", OPENPLC_ELEMENTS - 1)]
     OutsideTable { text: String },
 }
 
 /// Reads `%IX0.3`, `%QW2`, `%MD4`, `%IB5` (any case).
 pub fn parse_address(text: &str, addressing: Addressing) -> Result<LocatedAddress, AddressError> {
-    let owned = || text.to_owned();
-    let form = || AddressError::Form { text: text.to_owned() };
+    let owned = || text.chars().take(SHOWN).collect::<String>();
+    let form = || AddressError::Form { text: owned() };
     let mut rest = text.trim().strip_prefix('%').ok_or_else(form)?.chars().peekable();
     let area_letter = rest.next().map(|c| c.to_ascii_uppercase()).ok_or_else(form)?;
     let area = match area_letter {
@@ -130,42 +220,46 @@ pub fn parse_address(text: &str, addressing: Addressing) -> Result<LocatedAddres
         match parts.next() {
             None => Ok(None),
             Some(p) if !p.is_empty() && p.bytes().all(|b| b.is_ascii_digit()) => {
-                p.parse::<u32>().map(Some).map_err(|_| AddressError::TooLarge { text: text.to_owned() })
+                p.parse::<u32>().map(Some).map_err(|_| AddressError::TooLarge { text: owned() })
             }
-            Some(_) => Err(AddressError::Form { text: text.to_owned() }),
+            Some(_) => Err(form()),
         }
     };
     let (first, second, third) = (number()?.ok_or_else(form)?, number()?, number()?);
     if third.is_some() {
         return Err(form());
     }
-    let limit = |byte: u64| -> Result<u32, AddressError> {
-        u32::try_from(byte).ok().filter(|b| *b < 65_536).ok_or(AddressError::TooLarge { text: text.to_owned() })
+    let limit = |byte: u64, size: AddressSize| -> Result<u32, AddressError> {
+        let end = byte.saturating_add(u64::from(size.bytes()));
+        if end <= AREA_BYTES { Ok(byte as u32) } else { Err(AddressError::TooLarge { text: owned() }) }
     };
     let bit_of = |byte: u32, bit: u32| -> Result<LocatedAddress, AddressError> {
         if bit > 7 {
             let meant = format!("%{area_letter}X{}.{}", u64::from(byte) + u64::from(bit / 8), bit % 8);
-            return Err(AddressError::Bit { text: text.to_owned(), byte, bit, meant });
+            return Err(AddressError::Bit { text: owned(), byte, bit, meant });
         }
-        Ok(LocatedAddress { area, byte: limit(u64::from(byte))?, bit: Some(bit as u8), size: AddressSize::Bit })
+        Ok(LocatedAddress {
+            area,
+            byte: limit(u64::from(byte), AddressSize::Bit)?,
+            bit: Some(bit as u8),
+            size: AddressSize::Bit,
+        })
     };
-    if addressing == Addressing::OpenPlc && first >= 1024 && size.is_some() {
+    if addressing == Addressing::OpenPlc && first >= OPENPLC_ELEMENTS && size.is_some() {
         return Err(AddressError::OutsideTable { text: owned() });
     }
     match (size, second) {
         (Some(AddressSize::Bit), Some(bit)) => bit_of(first, bit),
         (None, Some(bit)) if addressing == Addressing::Byte => bit_of(first, bit),
-        (Some(AddressSize::Bit), None) => {
-            Err(AddressError::BareBit { text: owned(), meant: format!("%{area_letter}X{}.{}", first / 8, first % 8) })
-        }
+        (Some(AddressSize::Bit), None) => Err(AddressError::BareBit {
+            text: owned(),
+            meant: format!("%{area_letter}X{}.{}", first / 8, first % 8),
+        }),
         (None, _) => Err(AddressError::NoSize { text: owned() }),
         (Some(size), None) => {
-            let byte = match addressing {
-                Addressing::Byte => u64::from(first),
-                Addressing::Element => u64::from(first) * u64::from(size.bytes()),
-                Addressing::OpenPlc => size.openplc_base() + u64::from(first) * u64::from(size.bytes()),
-            };
-            Ok(LocatedAddress { area, byte: limit(byte)?, bit: None, size })
+            let unit = if addressing == Addressing::Byte { 1 } else { size.bytes() };
+            let byte = u64::from(addressing.base(size)) + u64::from(first) * u64::from(unit);
+            Ok(LocatedAddress { area, byte: limit(byte, size)?, bit: None, size })
         }
         // `%IW2.0`, byte addressing: a bit of the word that starts at byte 2, bit 8 being bit 0 of byte 3.
         (Some(size), Some(bit)) => {
@@ -241,26 +335,116 @@ mod tests {
         assert!(e("%IX9", Addressing::Element).contains("%IX1.1"));
         assert!(e("%IW1.9", Addressing::Element).contains("%IX3.1"));
         assert!(e("%I0.0", Addressing::Element).contains("size letter"));
-        for bad in ["", "%", "IX0.0", "%ZX0.0", "%IX", "%IX0.", "%IX.1", "%IX0.0.0", "%IW-1", "%IX0.0 1", "%IQ1"] {
+        for bad in
+            ["", "%", "IX0.0", "%ZX0.0", "%IX", "%IX0.", "%IX.1", "%IX0.0.0", "%IW-1", "%IX0.0 1", "%IQ1"]
+        {
             assert!(matches!(parse_address(bad, Addressing::Byte), Err(AddressError::Form { .. })), "{bad}");
         }
         assert!(matches!(parse_address("%IB65536", Addressing::Byte), Err(AddressError::TooLarge { .. })));
-        assert!(matches!(parse_address("%IB99999999999", Addressing::Byte), Err(AddressError::TooLarge { .. })));
-        assert!(matches!(parse_address("%ID4294967295", Addressing::Element), Err(AddressError::TooLarge { .. })));
+        assert!(matches!(
+            parse_address("%IB99999999999", Addressing::Byte),
+            Err(AddressError::TooLarge { .. })
+        ));
+        assert!(matches!(
+            parse_address("%ID4294967295", Addressing::Element),
+            Err(AddressError::TooLarge { .. })
+        ));
+        assert!(matches!(parse_address("%IW65535", Addressing::Byte), Err(AddressError::TooLarge { .. })));
+        assert!(matches!(parse_address("%IL8192", Addressing::Element), Err(AddressError::TooLarge { .. })));
+        assert_eq!(at("%IL8191", Addressing::Element).1, 65_528);
+        assert_eq!(at("%IX65535.7", Addressing::Element).1, 65_535);
         assert!(matches!(parse_address("%I*", Addressing::Byte), Err(AddressError::Incomplete { .. })));
         assert!(matches!(parse_address("%QW*", Addressing::Byte), Err(AddressError::Incomplete { .. })));
     }
 
+    #[test]
+    fn openplc_tables_end() {
+        for text in ["%MW1024", "%QX1024.0", "%ML1024"] {
+            assert_eq!(
+                parse_address(text, Addressing::OpenPlc),
+                Err(AddressError::OutsideTable { text: text.to_owned() })
+            );
+        }
+        for (size, base, room) in [
+            (AddressSize::Bit, 0, 1024),
+            (AddressSize::Word, 1024, 2048),
+            (AddressSize::Byte, 3072, 1024),
+            (AddressSize::Dword, 4096, 0),
+            (AddressSize::Lword, 8192, 0),
+        ] {
+            assert_eq!((Addressing::OpenPlc.base(size), Addressing::OpenPlc.room(size, 4096)), (base, room));
+            assert_eq!((Addressing::Element.base(size), Addressing::Element.room(size, 4096)), (0, 4096));
+        }
+        assert_eq!(Addressing::OpenPlc.room(AddressSize::Lword, 65_536), 8192);
+    }
+
+    #[test]
+    fn names_are_those_of_the_stack_file() {
+        for addressing in [Addressing::Element, Addressing::Byte, Addressing::OpenPlc] {
+            let json = serde_json::to_value(addressing).unwrap();
+            assert_eq!(json, addressing.name());
+            assert_eq!(serde_json::from_value::<Addressing>(json).unwrap(), addressing);
+            assert_eq!(Addressing::from_name(addressing.name()), Some(addressing));
+        }
+        assert_eq!(Addressing::from_name("words"), None);
+    }
+
+    #[test]
+    fn places_without_a_text() {
+        let new = LocatedAddress::new;
+        for (area, byte, bit, bytes) in [
+            ('X', 0, None, 1),
+            ('I', 0, None, 3),
+            ('I', 0, None, 0),
+            ('I', 0, Some(8), 1),
+            ('I', 65_535, None, 2),
+            ('I', u32::MAX, None, 8),
+        ] {
+            assert_eq!(new(area, byte, bit, bytes), None, "{area} {byte} {bit:?} {bytes}");
+        }
+        let text = |byte, bit, bytes, addressing| new('M', byte, bit, bytes).unwrap().text(addressing);
+        assert_eq!(text(3, None, 2, Addressing::Element), None);
+        assert_eq!(text(3, None, 2, Addressing::Byte).as_deref(), Some("%MW3"));
+        assert_eq!(text(3, None, 2, Addressing::OpenPlc), None);
+        assert_eq!(text(1026, None, 2, Addressing::OpenPlc).as_deref(), Some("%MW1"));
+        assert_eq!(text(3072, None, 2, Addressing::OpenPlc), None);
+        assert_eq!(text(1024, Some(0), 1, Addressing::OpenPlc), None);
+    }
+
+    #[test]
+    fn messages_show_no_more_than_40_characters() {
+        let long = "%IW0.é".repeat(1000);
+        let error = parse_address(&long, Addressing::Byte).unwrap_err().to_string();
+        assert!(error.chars().count() < 200, "{error}");
+    }
+
     proptest::proptest! {
+        #[test]
+        fn text_is_parsed_back(
+            area in "[IQM]", byte in 0..65_536_u32, bit in proptest::option::of(0..8_u8), size in 0..4_u32,
+        ) {
+            let bytes = if bit.is_some() { 1 } else { 1 << size };
+            let Some(place) = LocatedAddress::new(area.chars().next().unwrap(), byte, bit, bytes) else {
+                return Ok(());
+            };
+            for addressing in [Addressing::Element, Addressing::Byte, Addressing::OpenPlc] {
+                if let Some(text) = place.text(addressing) {
+                    proptest::prop_assert_eq!(parse_address(&text, addressing), Ok(place));
+                }
+            }
+            proptest::prop_assert!(place.text(Addressing::Byte).is_some());
+        }
         #[test]
         fn never_panics(text in "\\PC{0,12}") {
             let _ = parse_address(&text, Addressing::Element);
             let _ = parse_address(&text, Addressing::Byte);
+            let _ = parse_address(&text, Addressing::OpenPlc);
         }
         #[test]
         fn never_panics_on_near_addresses(text in "%[IQMiqm*][XBWDLxbwdl*]?[0-9]{0,11}(\\.[0-9]{0,11}){0,2}") {
             let _ = parse_address(&text, Addressing::Element);
             let _ = parse_address(&text, Addressing::Byte);
+            let _ = parse_address(&text, Addressing::OpenPlc);
         }
     }
 }

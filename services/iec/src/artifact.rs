@@ -380,7 +380,8 @@ impl DebugMap {
             return Some(found);
         }
         let matches = |s: &&Symbol| {
-            let tail = s.path.len().checked_sub(path.len()).and_then(|at| at.checked_sub(1).map(|dot| (dot, at)));
+            let tail =
+                s.path.len().checked_sub(path.len()).and_then(|at| at.checked_sub(1).map(|dot| (dot, at)));
             tail.is_some_and(|(dot, at)| {
                 s.path.is_char_boundary(dot)
                     && s.path.is_char_boundary(at)

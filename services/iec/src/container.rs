@@ -31,10 +31,12 @@ impl Artifact {
         while at < wasm.len() {
             let id = wasm[at];
             let (size, body) = leb(wasm, at + 1)?;
-            let end = body.checked_add(size).filter(|e| *e <= wasm.len()).ok_or(ArtifactError::Damaged { at })?;
+            let end =
+                body.checked_add(size).filter(|e| *e <= wasm.len()).ok_or(ArtifactError::Damaged { at })?;
             if id == 0 {
                 let (len, name) = leb(wasm, body)?;
-                let name_end = name.checked_add(len).filter(|e| *e <= end).ok_or(ArtifactError::Damaged { at })?;
+                let name_end =
+                    name.checked_add(len).filter(|e| *e <= end).ok_or(ArtifactError::Damaged { at })?;
                 if wasm[name..name_end] == *MAP_SECTION.as_bytes() {
                     return Ok(Self { wasm: wasm.to_vec(), map: read_map(&wasm[name_end..end])? });
                 }

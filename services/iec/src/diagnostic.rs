@@ -107,7 +107,8 @@ impl Diagnostics {
             let s = d.primary.as_ref().map_or(Span::default(), |p| p.span);
             (s.file, s.start, s.end)
         });
-        let mut files: Vec<(String, String)> = sources.iter().map(|s| (s.name.clone(), s.text.clone())).collect();
+        let mut files: Vec<(String, String)> =
+            sources.iter().map(|s| (s.name.clone(), s.text.clone())).collect();
         files.push((crate::stdlib::NAME.to_owned(), crate::stdlib::PRELUDE.to_owned()));
         Self { items, files }
     }

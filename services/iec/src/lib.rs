@@ -7,20 +7,23 @@
 //! constants; tree to IR), [`ir`] (small, typed, ignorant of wasm), [`wasm`] (IR to module and debug map).
 //! Other languages join at the syntax tree.
 
+// Tables of keywords and types read better without the prefix.
+#![allow(clippy::enum_glob_use)]
+
 pub mod artifact;
 
 mod address;
 pub mod analyze;
 pub mod codes;
+mod container;
+mod diagnostic;
 pub mod ir;
 pub mod lexer;
+pub mod limits;
+pub mod stdlib;
 pub mod syntax;
 pub mod types;
 pub mod wasm;
-mod container;
-mod diagnostic;
-pub mod limits;
-pub mod stdlib;
 
 pub use address::{AddressError, AddressSize, Addressing, LocatedAddress, parse_address};
 pub use artifact::Artifact;
@@ -125,7 +128,7 @@ impl Compiled {
 /// On failure: all errors and warnings found. Never panics, whatever the text.
 pub fn compile(sources: &[Source], options: &Options) -> Result<Compiled, Diagnostics> {
     if let Err(d) = check_sources(sources) {
-        return Err(Diagnostics::new(sources, vec![d]));
+        return Err(Diagnostics::new(sources, vec![*d]));
     }
     let mut statements = syntax::StatementTable::default();
     let mut units = Vec::with_capacity(sources.len() + 1);
@@ -139,7 +142,8 @@ pub fn compile(sources: &[Source], options: &Options) -> Result<Compiled, Diagno
     let (unit, mut found) = syntax::parse_library(library as u32, &mut statements);
     units.push(unit);
     diags.append(&mut found);
-    let (analyzed, mut found) = analyze::analyze(&units, library, options, !diags.is_empty());
+    let syntax_errors = diags.iter().any(|d| d.severity == Severity::Error);
+    let (analyzed, mut found) = analyze::analyze(&units, library, options, syntax_errors);
     diags.append(&mut found);
     if let (Some(a), true) = (analyzed, diags.iter().all(|d| d.severity == Severity::Warning)) {
         match wasm::emit(&a, &statements.spans, sources, options) {
@@ -147,23 +151,30 @@ pub fn compile(sources: &[Source], options: &Options) -> Result<Compiled, Diagno
                 let warnings = Diagnostics::new(sources, diags).items().to_vec();
                 return Ok(Compiled { artifact, warnings });
             }
-            Err(d) => diags.push(d),
+            Err(d) => diags.push(*d),
         }
     }
     Err(Diagnostics::new(sources, diags))
 }
 
-fn check_sources(sources: &[Source]) -> Result<(), Diagnostic> {
+fn check_sources(sources: &[Source]) -> Result<(), Box<Diagnostic>> {
     if sources.is_empty() || sources.len() > limits::SOURCES {
         let d = Diagnostic::placeless("E0807", format!("{} source files given", sources.len()));
-        return Err(d.help(format!("give 1 to {} files", limits::SOURCES)));
+        return Err(Box::new(d.help(format!("give 1 to {} files", limits::SOURCES))));
     }
     match sources.iter().find(|s| s.text.len() > limits::SOURCE_BYTES) {
-        Some(s) => Err(Diagnostic::placeless(
-            "E0807",
-            format!("{}: file of {} bytes, at most {} are allowed", s.name, s.text.len(), limits::SOURCE_BYTES),
-        )
-        .help("split the program into several files")),
+        Some(s) => Err(Box::new(
+            Diagnostic::placeless(
+                "E0807",
+                format!(
+                    "{}: file of {} bytes, at most {} are allowed",
+                    s.name,
+                    s.text.len(),
+                    limits::SOURCE_BYTES
+                ),
+            )
+            .help("split the program into several files"),
+        )),
         None => Ok(()),
     }
 }

@@ -108,7 +108,9 @@ pub struct RoutePlan<'a> {
 
 /// The type of this name; TIME and STRING cannot be routed.
 pub fn elem_type(name: &str) -> Option<ElemType> {
-    use ElemType::*;
+    use ElemType::{
+        Bool, Byte, Dint, Dword, Int, Lint, Lreal, Lword, Real, Sint, Udint, Uint, Ulint, Usint, Word,
+    };
     [Bool, Byte, Word, Dword, Lword, Sint, Int, Dint, Lint, Usint, Uint, Udint, Ulint, Real, Lreal]
         .into_iter()
         .find(|t| t.name().eq_ignore_ascii_case(name))

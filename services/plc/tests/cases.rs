@@ -1,4 +1,5 @@
 //! The shared case files through the tracer: one program, the value of every output in every scan.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 use dinrail_iec::Source;
 use dinrail_plc::trace::{Setting, trace_case, trace_scans};

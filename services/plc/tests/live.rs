@@ -4,6 +4,7 @@
 //! This process plays launcher, field service and recorder; the same executable, started again with a variable
 //! set, is the plc service.
 #![allow(unsafe_code)]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 use dinrail_plc::engine::Program;
 use dinrail_plc::verify::Verifier;
@@ -27,7 +28,7 @@ use std::time::{Duration, Instant};
 const ROOT: &str = "DINRAIL_PLC_TEST_ROOT";
 const GENERATION: &str = "DINRAIL_PLC_TEST_GENERATION";
 const RETAIN: &str = "DINRAIL_PLC_TEST_RETAIN";
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 const MAIN: &str = "PROGRAM main
 VAR out AT %QW0 : UINT; setpoint AT %MW0 : UINT; sel : INT; zero : INT; r : INT; t : TON; scans : UDINT; END_VAR
@@ -42,6 +43,14 @@ END_PROGRAM";
 #[test]
 fn child() {
     let Some(root) = std::env::var_os(ROOT) else { return };
+    let parent = std::os::unix::process::parent_id();
+    std::thread::spawn(move || {
+        // A test that was killed leaves nobody behind.
+        while std::os::unix::process::parent_id() == parent {
+            std::thread::sleep(Duration::from_millis(200));
+        }
+        std::process::exit(1);
+    });
     let number = |name: &str| std::env::var(name).unwrap().parse::<i32>().unwrap();
     // SAFETY: the parent passed this descriptor and nobody else in this process knows it.
     let fd = unsafe { OwnedFd::from_raw_fd(number(RETAIN)) };
@@ -114,7 +123,17 @@ fn stack(name: &str, root: &Path, prefix: &str, dir: &Path, config: &Value) -> S
     let mut add = |name: String, kind: TopicKind, depth: u32, max_tail: u32, wakes: Vec<Wake>| {
         let (max_publishers, max_subscribers) = rail::port_limits(kind, 3, 3);
         let (writers, readers) = (Vec::new(), Vec::new());
-        topics.push(TopicEntry { name, kind, depth, max_tail, writers, readers, wakes, max_publishers, max_subscribers });
+        topics.push(TopicEntry {
+            name,
+            kind,
+            depth,
+            max_tail,
+            writers,
+            readers,
+            wakes,
+            max_publishers,
+            max_subscribers,
+        });
     };
     let wakes_plc = |event_id| vec![Wake { service: "plc".into(), event_id }];
     for decl in &plc.topics {
@@ -125,9 +144,12 @@ fn stack(name: &str, root: &Path, prefix: &str, dir: &Path, config: &Value) -> S
         };
         add(decl.kind.of("plc"), decl.kind, decl.depth, decl.max_tail, wakes);
     }
-    for (kind, service) in
-        [(TopicKind::Health, "plc"), (TopicKind::Status, "plc"), (TopicKind::Health, "io"), (TopicKind::Status, "io")]
-    {
+    for (kind, service) in [
+        (TopicKind::Health, "plc"),
+        (TopicKind::Status, "plc"),
+        (TopicKind::Health, "io"),
+        (TopicKind::Status, "io"),
+    ] {
         add(kind.of(service), kind, kind.row().depth, kind.row().max_tail, Vec::new());
     }
     add("io/inputs".into(), TopicKind::Inputs, 4, 4096, wakes_plc(2));
@@ -209,7 +231,9 @@ impl World {
             self.inputs.send_tail(Inputs { ranges: 1, ..Inputs::default() }, &[a, b, 0]).unwrap();
             self.inputs.ring();
         }
-        let Self { images, scans, keyframes, results, events, joiners, recorded, gaps, seen, answers, .. } = self;
+        let Self {
+            images, scans, keyframes, results, events, joiners, recorded, gaps, seen, answers, ..
+        } = self;
         for (port, joiner) in [(keyframes, &mut joiners.1), (scans, &mut joiners.0)] {
             port.drain(100_000, |header, tail| {
                 let step = joiner.push(header, tail);
@@ -219,7 +243,8 @@ impl World {
                 }
             });
         }
-        results.drain(100, |r, tail| answers.push((r.job_seq, r.code, serde_json::from_slice(tail).unwrap())));
+        results
+            .drain(100, |r, tail| answers.push((r.job_seq, r.code, serde_json::from_slice(tail).unwrap())));
         events.drain(1000, |_, tail| seen.push(serde_json::from_slice(tail).unwrap()));
         let (image, area, generation) = (&mut self.image, &mut self.area, &mut self.generation);
         images.newest(|header, tail| {
@@ -234,7 +259,12 @@ impl World {
     fn until(&mut self, what: &str, mut check: impl FnMut(&Self) -> bool) {
         let limit = Instant::now() + PATIENCE;
         while !check(self) {
-            assert!(Instant::now() < limit, "waited in vain for: {what}; image {:?}, events {:#?}", self.image.state, self.seen);
+            assert!(
+                Instant::now() < limit,
+                "waited in vain for: {what}; image {:?}, events {:#?}",
+                self.image.state,
+                self.seen
+            );
             self.turn();
         }
     }
@@ -309,7 +339,8 @@ fn a_plc_service_from_its_first_scan_to_its_return_from_death() {
     let header = ImageWrite { ops: ops.ops(), ..ImageWrite::default() };
     let seq = world.writes.send_tail(header, ops.tail()).unwrap();
     world.writes.ring();
-    world.until("the acknowledgement", |w| acks(&w.image).any(|a| (a.writer, a.seq, a.result) == (1, seq, 0)));
+    world
+        .until("the acknowledgement", |w| acks(&w.image).any(|a| (a.writer, a.seq, a.result) == (1, seq, 0)));
     world.until("the write's effect", |w| w.out() == Some(142));
 
     // Jobs.
@@ -340,7 +371,9 @@ fn a_plc_service_from_its_first_scan_to_its_return_from_death() {
     assert_eq!(world.job(&json!({ "do": "write", "var": "sel", "value": 1 })).0, 0);
     let fault = world.event(EventKind::ProgramFault);
     assert_eq!((&fault.detail["file"], &fault.detail["line"]), (&json!("main.st"), &json!(7)));
-    world.until("the warm start", |w| w.image.plc_state() == PlcState::Run && w.seen.iter().any(|e| e.detail["start"] == "warm"));
+    world.until("the warm start", |w| {
+        w.image.plc_state() == PlcState::Run && w.seen.iter().any(|e| e.detail["start"] == "warm")
+    });
     assert!(world.read("kept").as_u64().unwrap() >= kept);
     world.seen.clear();
 
@@ -356,7 +389,9 @@ fn a_plc_service_from_its_first_scan_to_its_return_from_death() {
     // Death and return: the old program again, RETAIN from the held memory.
     let kept = world.read("kept").as_u64().unwrap();
     ground.start(2, &retain_fd);
-    world.until("the return", |w| w.generation == 2 && w.image.plc_state() == PlcState::Run && w.out() == Some(10));
+    world.until("the return", |w| {
+        w.generation == 2 && w.image.plc_state() == PlcState::Run && w.out() == Some(10)
+    });
     assert!(world.read("kept").as_u64().unwrap() >= kept);
     assert!(world.read("scans").as_u64().unwrap() < kept);
     assert_eq!(world.job(&json!({ "do": "keyframe" })).0, 0);

@@ -1,5 +1,6 @@
 //! What is measured on, and what processes cost: `/proc`.
 
+use rustix::param::clock_ticks_per_second;
 use rustix::thread::{CpuSet, Pid, sched_getaffinity, sched_setaffinity};
 use serde::{Deserialize, Serialize};
 use std::fmt;
@@ -55,6 +56,45 @@ pub fn cpu_seconds(pid: u32) -> Option<f64> {
         ns += text.split(' ').next().and_then(|n| n.parse::<u64>().ok()).unwrap_or(0);
     }
     Some(ns as f64 / 1e9)
+}
+
+/// CPU time of the whole machine and of this bench with its stack, in seconds.
+pub struct MachineMeter {
+    began: Instant,
+    busy: f64,
+    own: f64,
+}
+
+impl MachineMeter {
+    pub fn start() -> Self {
+        Self { began: Instant::now(), busy: busy_seconds(), own: own_seconds() }
+    }
+
+    /// Per cent of one CPU that everything else on the machine took. Call it when the stack has ended: only then
+    /// its time counts as the bench's.
+    pub fn others(&self) -> f64 {
+        let others = (busy_seconds() - self.busy) - (own_seconds() - self.own);
+        others.max(0.0) / self.began.elapsed().as_secs_f64() * 100.0
+    }
+}
+
+/// All CPUs together, time taken by the hypervisor included.
+fn busy_seconds() -> f64 {
+    let text = read_to_string("/proc/stat").unwrap_or_default();
+    let fields = text.lines().next().unwrap_or_default().split_whitespace().skip(1);
+    let ticks: Vec<f64> = fields.map_while(|n| n.parse().ok()).collect();
+    // user nice system idle iowait irq softirq steal; guest time is in user time already.
+    let busy = [0, 1, 2, 5, 6, 7].iter().filter_map(|i| ticks.get(*i)).sum::<f64>();
+    busy / clock_ticks_per_second() as f64
+}
+
+/// This process and all its ended descendants.
+fn own_seconds() -> f64 {
+    let text = read_to_string("/proc/self/stat").unwrap_or_default();
+    // Behind the name, which may hold anything: state is field 3, utime 14, stime 15, cutime 16, cstime 17.
+    let fields = text.rsplit_once(')').map_or("", |(_, rest)| rest).split_whitespace();
+    let ticks = fields.skip(11).take(4).filter_map(|n| n.parse::<f64>().ok()).sum::<f64>();
+    ticks / clock_ticks_per_second() as f64
 }
 
 /// The CPUs this process may use, ascending.
@@ -125,6 +165,8 @@ mod tests {
         assert!(memory.pss_bytes > 100_000 && memory.rss_bytes >= memory.pss_bytes, "{memory:?}");
         assert!(cpu_seconds(own).unwrap() > 0.0);
         assert!(!cpus().is_empty());
+        let meter = MachineMeter::start();
+        assert!(meter.busy > 0.0 && meter.others() >= 0.0);
         assert_eq!(cpu_seconds(u32::MAX), None);
         let machine = Machine::read();
         assert!(machine.cores > 0 && !machine.kernel.is_empty() && !machine.cpu.is_empty());

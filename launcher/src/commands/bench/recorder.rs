@@ -89,7 +89,8 @@ struct Bus {
     tx: Publisher<CanFrame>,
     status: Subscriber<Status>,
     sent: u64,
-    on_bus: u64,
+    /// Of these, on the bus by the driver's word.
+    arrived: u64,
 }
 
 impl Bus {
@@ -100,7 +101,7 @@ impl Bus {
             status: ctx.subscriber(&format!("{name}/status"))?,
             name,
             sent: 0,
-            on_bus: 0,
+            arrived: 0,
         })
     }
 
@@ -167,9 +168,9 @@ fn wait_for_buses(stack: &mut BenchStack, buses: &mut [Bus]) -> anyhow::Result<(
         stack.wait(&format!("{sent} frames on {name}"), |_| {
             bus.status.newest(|_, tail| {
                 let status: serde_json::Value = serde_json::from_slice(tail).unwrap_or_default();
-                bus.on_bus = status["bus"]["from_rail"].as_u64().unwrap_or(bus.on_bus);
+                bus.arrived = status["bus"]["from_rail"].as_u64().unwrap_or(bus.arrived);
             });
-            (bus.on_bus == sent).then_some(())
+            (bus.arrived == sent).then_some(())
         })?;
     }
     Ok(())

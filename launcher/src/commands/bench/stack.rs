@@ -201,7 +201,10 @@ impl BenchStack {
 
 impl Drop for BenchStack {
     fn drop(&mut self) {
-        if !self.ended && self.end(Duration::from_secs(10)).is_err() && !self.ended {
+        if !self.ended {
+            let _ = self.end(Duration::from_secs(10));
+        }
+        if !self.ended {
             let _ = self.launcher.kill();
             let _ = self.launcher.wait();
         }

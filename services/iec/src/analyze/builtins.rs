@@ -77,8 +77,29 @@ const TABLE: &[(&str, Kind, &[&str], usize)] = &[
 
 /// Functions of the standard that are not there yet.
 const MISSING: &[&str] = &[
-    "LEN", "LEFT", "RIGHT", "MID", "CONCAT", "INSERT", "DELETE", "REPLACE", "FIND", "ADR", "SIZEOF", "ATAN2", "CEIL", "FLOOR",
-    "ROUND", "REF", "CONCAT_DATE", "CONCAT_TOD", "DAY_OF_WEEK", "SPLIT_DATE", "IS_VALID", "LOWER_BOUND", "UPPER_BOUND",
+    "LEN",
+    "LEFT",
+    "RIGHT",
+    "MID",
+    "CONCAT",
+    "INSERT",
+    "DELETE",
+    "REPLACE",
+    "FIND",
+    "ADR",
+    "SIZEOF",
+    "ATAN2",
+    "CEIL",
+    "FLOOR",
+    "ROUND",
+    "REF",
+    "CONCAT_DATE",
+    "CONCAT_TOD",
+    "DAY_OF_WEEK",
+    "SPLIT_DATE",
+    "IS_VALID",
+    "LOWER_BOUND",
+    "UPPER_BOUND",
 ];
 
 /// True for the name (upper case) of a standard function.
@@ -88,7 +109,13 @@ pub fn is_builtin(name: &str) -> bool {
 
 /// True for a standard function that is known and not supported yet.
 pub fn is_missing(name: &str) -> bool {
-    let string = |n: &str| n.contains("STRING") || n.contains("DATE") || n.contains("TOD") || n.contains("BCD") || n.contains("CHAR");
+    let string = |n: &str| {
+        n.contains("STRING")
+            || n.contains("DATE")
+            || n.contains("TOD")
+            || n.contains("BCD")
+            || n.contains("CHAR")
+    };
     MISSING.contains(&name) || (name.contains("_TO_") && string(name))
 }
 
@@ -99,29 +126,50 @@ pub fn names() -> impl Iterator<Item = &'static str> {
 
 impl Checker<'_> {
     /// Calls a standard function; `None` if there is none of this name.
-    pub fn builtin(&mut self, callee: &Ident, args: &[Arg], span: Span, want: Option<ElemType>) -> Option<Val> {
+    pub fn builtin(
+        &mut self,
+        callee: &Ident,
+        args: &[Arg],
+        span: Span,
+        want: Option<ElemType>,
+    ) -> Option<Val> {
         let key = callee.key();
         if key == "__NOW" {
             return Some(Val::elem(Expr::new(ElemType::Time, ExprKind::Now)));
         }
         if let Some(c) = conversion(&key) {
-            let Some(inputs) = self.match_args(callee, args, &["IN"], 1, span) else { return Some(Val::Error) };
+            let Some(inputs) = self.match_args(callee, args, &["IN"], 1, span) else {
+                return Some(Val::Error);
+            };
             let hint = c.from;
             let v = self.expr(inputs[0], hint);
             return Some(self.convert_call(c, v, inputs[0].span, want));
         }
         let (name, kind, params, least) = *TABLE.iter().find(|t| t.0 == key)?;
-        let Some(inputs) = self.match_args(callee, args, params, least, span) else { return Some(Val::Error) };
+        let Some(inputs) = self.match_args(callee, args, params, least, span) else {
+            return Some(Val::Error);
+        };
         Some(self.call_builtin(name, kind, &inputs, span, want))
     }
 
     /// Arguments in order of the parameters.
-    fn match_args<'e>(&mut self, callee: &Ident, args: &'e [Arg], params: &[&str], least: usize, span: Span) -> Option<Vec<&'e ast::Expr>> {
+    fn match_args<'e>(
+        &mut self,
+        callee: &Ident,
+        args: &'e [Arg],
+        params: &[&str],
+        least: usize,
+        span: Span,
+    ) -> Option<Vec<&'e ast::Expr>> {
         let endless = params.last().is_some_and(|p| p.ends_with(".."));
         let most = if endless { usize::MAX } else { params.len() };
         let count_error = |n: usize| {
             let expected = if endless { format!("{least} or more") } else { least.to_string() };
-            Diagnostic::new("E0501", span, format!("{} takes {expected} arguments, {n} given", callee.text.to_ascii_uppercase()))
+            Diagnostic::new(
+                "E0501",
+                span,
+                format!("{} takes {expected} argument(s), {n} given", callee.text.to_ascii_uppercase()),
+            )
         };
         if args.iter().all(|a| a.name.is_none()) {
             if args.len() < least || args.len() > most {
@@ -137,10 +185,16 @@ impl Checker<'_> {
                 return None;
             };
             let position = position(params, &name.key());
-            let (Some(i), false, Some(value)) = (position.filter(|i| *i < most.min(args.len())), a.output, &a.value) else {
+            let (Some(i), false, Some(value)) =
+                (position.filter(|i| *i < most.min(args.len())), a.output, &a.value)
+            else {
                 let known: Vec<&str> = params.to_vec();
-                let d = Diagnostic::new("E0502", name.span, format!("{} has no input `{}`", callee.text.to_ascii_uppercase(), name.text))
-                    .help(format!("its inputs: {}", known.join(", ")));
+                let d = Diagnostic::new(
+                    "E0502",
+                    name.span,
+                    format!("{} has no input `{}`", callee.text.to_ascii_uppercase(), name.text),
+                )
+                .help(format!("its inputs: {}", known.join(", ")));
                 self.report(d);
                 return None;
             };
@@ -161,7 +215,14 @@ impl Checker<'_> {
         Some(found)
     }
 
-    fn call_builtin(&mut self, name: &str, kind: Kind, inputs: &[&ast::Expr], span: Span, want: Option<ElemType>) -> Val {
+    fn call_builtin(
+        &mut self,
+        name: &str,
+        kind: Kind,
+        inputs: &[&ast::Expr],
+        span: Span,
+        want: Option<ElemType>,
+    ) -> Val {
         match kind {
             Kind::Abs => self.abs(inputs[0], want),
             Kind::Sqrt | Kind::Math(_) => self.math(name, kind, inputs[0], want),
@@ -182,26 +243,35 @@ impl Checker<'_> {
                 value
             }
             Kind::Not => {
-                let e = ast::Expr { span, kind: ast::ExprKind::Unary(ast::Unary::Not, Box::new(inputs[0].clone())) };
+                let e = ast::Expr {
+                    span,
+                    kind: ast::ExprKind::Unary(ast::Unary::Not, Box::new(inputs[0].clone())),
+                };
                 self.expr(&e, want)
             }
             Kind::Shift(op) => self.shift(name, op, inputs, want),
             Kind::Sel => self.sel(inputs, span, want),
             Kind::Extreme(op) => {
-                let Some((values, _)) = self.same_type(name, inputs, span, want, false) else { return Val::Error };
+                let Some((values, _)) = self.same_type(name, inputs, span, want, false) else {
+                    return Val::Error;
+                };
                 Val::elem(reduce(op, values))
             }
             Kind::Limit => {
-                let Some((values, _)) = self.same_type(name, inputs, span, want, false) else { return Val::Error };
+                let Some((values, _)) = self.same_type(name, inputs, span, want, false) else {
+                    return Val::Error;
+                };
                 let mut it = values.into_iter();
-                let (Some(mn), Some(x), Some(mx)) = (it.next(), it.next(), it.next()) else { return Val::Error };
+                let (Some(mn), Some(x), Some(mx)) = (it.next(), it.next(), it.next()) else {
+                    return Val::Error;
+                };
                 let low = reduce(BinOp::Max, vec![x, mn]);
                 Val::elem(reduce(BinOp::Min, vec![low, mx]))
             }
             Kind::Mux => self.mux(inputs, span, want),
             Kind::Move => {
                 let v = self.expr(inputs[0], want);
-                if matches!(v, Val::Whole(..) | Val::Void) { self.bad_operand(name, &v, inputs[0].span) } else { v }
+                if matches!(v, Val::Whole(..)) { self.bad_operand(name, &v, inputs[0].span) } else { v }
             }
         }
     }
@@ -231,8 +301,12 @@ impl Checker<'_> {
                 if let Val::Expr(e, _) = &v
                     && e.ty.is_int()
                 {
-                    let d = Diagnostic::new("E0402", input.span, format!("{name} takes REAL or LREAL, not {}", e.ty.name()))
-                        .help(format!("convert with {}_TO_REAL", e.ty.name()));
+                    let d = Diagnostic::new(
+                        "E0402",
+                        input.span,
+                        format!("{name} takes REAL or LREAL, not {}", e.ty.name()),
+                    )
+                    .help(format!("convert with {}_TO_REAL", e.ty.name()));
                     self.report(d);
                     return Val::Error;
                 }
@@ -251,8 +325,12 @@ impl Checker<'_> {
         let value = match self.expr(inputs[0], hint) {
             v @ Val::Int(_) => {
                 let Some(ty) = hint else {
-                    let d = Diagnostic::new("E0402", inputs[0].span, format!("{name} needs to know the width of its value"))
-                        .help("write the literal with its type, for example WORD#16#8001");
+                    let d = Diagnostic::new(
+                        "E0402",
+                        inputs[0].span,
+                        format!("{name} needs to know the width of its value"),
+                    )
+                    .help("write the literal with its type, for example WORD#16#8001");
                     self.report(d);
                     return Val::Error;
                 };
@@ -264,8 +342,12 @@ impl Checker<'_> {
                 if let Val::Expr(e, _) = &v
                     && e.ty.is_int()
                 {
-                    let d = Diagnostic::new("E0402", inputs[0].span, format!("{name} takes a bit string, not {}", e.ty.name()))
-                        .help(format!("convert, for example {}_TO_WORD(x)", e.ty.name()));
+                    let d = Diagnostic::new(
+                        "E0402",
+                        inputs[0].span,
+                        format!("{name} takes a bit string, not {}", e.ty.name()),
+                    )
+                    .help(format!("convert, for example {}_TO_WORD(x)", e.ty.name()));
                     self.report(d);
                     return Val::Error;
                 }
@@ -274,7 +356,9 @@ impl Checker<'_> {
         };
         let count = self.expr(inputs[1], None);
         let count = match count {
-            Val::Int(n) => Some(Expr::int(ElemType::Dint, n.clamp(i128::from(i32::MIN), i128::from(i32::MAX)) as i64)),
+            Val::Int(n) => {
+                Some(Expr::int(ElemType::Dint, n.clamp(i128::from(i32::MIN), i128::from(i32::MAX)) as i64))
+            }
             Val::Expr(e, Type::Elem(ty)) if ty.is_int() => {
                 let to = if ty.is_wide() || ty == ElemType::Udint { ElemType::Lint } else { ElemType::Dint };
                 Some(super::conversions::convert(e, to))
@@ -288,7 +372,9 @@ impl Checker<'_> {
 
     fn sel(&mut self, inputs: &[&ast::Expr], span: Span, want: Option<ElemType>) -> Val {
         let cond = self.condition(inputs[0], "G of SEL");
-        let Some((values, ty)) = self.same_type("SEL", &inputs[1..], span, want, true) else { return Val::Error };
+        let Some((values, ty)) = self.same_type("SEL", &inputs[1..], span, want, true) else {
+            return Val::Error;
+        };
         let mut it = values.into_iter();
         let (Some(zero), Some(one)) = (it.next(), it.next()) else { return Val::Error };
         let elem = zero.ty;
@@ -297,13 +383,19 @@ impl Checker<'_> {
 
     fn mux(&mut self, inputs: &[&ast::Expr], span: Span, want: Option<ElemType>) -> Val {
         let selector = self.expr(inputs[0], None);
-        let Some((values, ty)) = self.same_type("MUX", &inputs[1..], span, want, true) else { return Val::Error };
+        let Some((values, ty)) = self.same_type("MUX", &inputs[1..], span, want, true) else {
+            return Val::Error;
+        };
         let selector = match selector {
             Val::Int(k) => {
                 let chosen = usize::try_from(k).ok().and_then(|k| values.into_iter().nth(k));
                 return match chosen {
                     Some(e) => Val::Expr(e, ty),
-                    None => self.error("E0406", inputs[0].span, format!("K of MUX is {k}; there are inputs IN0 to IN{}", inputs.len() - 2)),
+                    None => self.error(
+                        "E0406",
+                        inputs[0].span,
+                        format!("K of MUX is {k}; there are inputs IN0 to IN{}", inputs.len() - 2),
+                    ),
                 };
             }
             Val::Expr(e, Type::Elem(t)) if t.is_int() => e,
@@ -315,13 +407,20 @@ impl Checker<'_> {
     }
 
     /// Values brought to one elementary type (or all of one enumeration, where that is allowed).
-    fn same_type(&mut self, name: &str, inputs: &[&ast::Expr], span: Span, want: Option<ElemType>, any: bool) -> Option<(Vec<Expr>, Type)> {
+    fn same_type(
+        &mut self,
+        name: &str,
+        inputs: &[&ast::Expr],
+        span: Span,
+        want: Option<ElemType>,
+        any: bool,
+    ) -> Option<(Vec<Expr>, Type)> {
         let values: Vec<(Val, Span)> = inputs.iter().map(|e| (self.expr(e, want), e.span)).collect();
         if values.iter().any(|(v, _)| matches!(v, Val::Error)) {
             return None;
         }
         for (v, s) in &values {
-            if matches!(v, Val::Whole(..) | Val::Void) {
+            if matches!(v, Val::Whole(..)) {
                 self.bad_operand(name, v, *s);
                 return None;
             }
@@ -357,7 +456,7 @@ impl Checker<'_> {
         }
         let ty = match common {
             Some(c) => c.ty,
-            None => self.literal_type(&values, want),
+            None => Self::literal_type(&values, want),
         };
         let mut out = Vec::new();
         for (v, s) in values {
@@ -367,11 +466,13 @@ impl Checker<'_> {
     }
 
     /// A type for literals among themselves.
-    fn literal_type(&self, values: &[(Val, Span)], want: Option<ElemType>) -> ElemType {
+    fn literal_type(values: &[(Val, Span)], want: Option<ElemType>) -> ElemType {
         if values.iter().any(|(v, _)| matches!(v, Val::Real(..))) {
             return want.filter(|w| w.is_real()).unwrap_or(ElemType::Lreal);
         }
-        let fits = |t: &ElemType| values.iter().all(|(v, _)| matches!(v, Val::Int(n) if super::check::int_const(*t, *n).is_some()));
+        let fits = |t: &ElemType| {
+            values.iter().all(|(v, _)| matches!(v, Val::Int(n) if super::check::int_const(*t, *n).is_some()))
+        };
         want.iter()
             .chain(&[ElemType::Dint, ElemType::Lint, ElemType::Ulint])
             .copied()

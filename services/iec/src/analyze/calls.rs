@@ -37,8 +37,14 @@ impl<'a> Checker<'a> {
             }
             Callee::Instance(_, pou) => {
                 let name = &self.tables.pous[pou as usize].name.text;
-                let d = Diagnostic::new("E0505", span, format!("a call of a function block ({name}) has no value"))
-                    .help("call it as a statement of its own, then read its outputs: inst(IN := x); y := inst.Q;");
+                let d = Diagnostic::new(
+                    "E0505",
+                    span,
+                    format!("a call of a function block ({name}) has no value"),
+                )
+                .help(
+                    "call it as a statement of its own, then read its outputs: inst(IN := x); y := inst.Q;",
+                );
                 self.report(d);
                 Val::Error
             }
@@ -48,7 +54,8 @@ impl<'a> Checker<'a> {
                     Val::Expr(Expr::new(elem, ExprKind::Call(Box::new(call))), ty)
                 }
                 Some((_, None)) => {
-                    let d = Diagnostic::new("E0505", span, format!("function {} has no result", pou.name.text));
+                    let d =
+                        Diagnostic::new("E0505", span, format!("function {} has no result", pou.name.text));
                     self.report(d);
                     Val::Error
                 }
@@ -96,7 +103,9 @@ impl<'a> Checker<'a> {
     }
 
     fn unused_result(&mut self, name: &str, span: Span) {
-        self.report(Diagnostic::new("W0202", span, format!("the result of {name} is not used")).help("assign it"));
+        self.report(
+            Diagnostic::new("W0202", span, format!("the result of {name} is not used")).help("assign it"),
+        );
     }
 
     /// So that mistakes in the arguments of an unknown function are shown too.
@@ -119,7 +128,8 @@ impl<'a> Checker<'a> {
         };
         let key = name.key();
         let own = self.pou.and_then(|p| p.by_name.get(&key).map(|i| p.vars[*i as usize].ty.clone()));
-        let global = self.tables.globals_by_name.get(&key).map(|g| self.tables.globals[*g as usize].ty.clone());
+        let global =
+            self.tables.globals_by_name.get(&key).map(|g| self.tables.globals[*g as usize].ty.clone());
         let variable = own.or(global);
         if let Some(Type::Fb(p)) = variable {
             return match self.place(callee) {
@@ -135,14 +145,22 @@ impl<'a> Checker<'a> {
             return match pou.kind {
                 PouKind::Function => Callee::Function(p, pou),
                 PouKind::FunctionBlock => {
-                    let d = Diagnostic::new("E0506", name.span, format!("`{}` is a function block type; instances are called", name.text))
-                        .help(format!("declare VAR x : {}; END_VAR and call x(...)", pou.name.text));
+                    let d = Diagnostic::new(
+                        "E0506",
+                        name.span,
+                        format!("`{}` is a function block type; instances are called", name.text),
+                    )
+                    .help(format!("declare VAR x : {}; END_VAR and call x(...)", pou.name.text));
                     self.report(d);
                     Callee::Error
                 }
                 PouKind::Program => {
-                    let d = Diagnostic::new("E0506", name.span, format!("PROGRAM `{}` cannot be called", name.text))
-                        .help("programs are run by tasks; make it a FUNCTION_BLOCK to call it");
+                    let d = Diagnostic::new(
+                        "E0506",
+                        name.span,
+                        format!("PROGRAM `{}` cannot be called", name.text),
+                    )
+                    .help("programs are run by tasks; make it a FUNCTION_BLOCK to call it");
                     self.report(d);
                     Callee::Error
                 }
@@ -159,9 +177,16 @@ impl<'a> Checker<'a> {
             self.report(Diagnostic::new("E0906", name.span, format!("{key} is not supported yet")));
             return Callee::Error;
         }
-        let functions = self.tables.pous.iter().filter(|p| p.kind == PouKind::Function).map(|p| p.name.text.as_str());
-        let instances = self.pou.iter().flat_map(|p| p.vars.iter()).filter(|v| matches!(v.ty, Type::Fb(_))).map(|v| v.name.text.as_str());
-        let mut d = Diagnostic::new("E0506", name.span, format!("there is no function or instance `{}`", name.text));
+        let functions =
+            self.tables.pous.iter().filter(|p| p.kind == PouKind::Function).map(|p| p.name.text.as_str());
+        let instances = self
+            .pou
+            .iter()
+            .flat_map(|p| p.vars.iter())
+            .filter(|v| matches!(v.ty, Type::Fb(_)))
+            .map(|v| v.name.text.as_str());
+        let mut d =
+            Diagnostic::new("E0506", name.span, format!("there is no function or instance `{}`", name.text));
         if let Some(n) = nearest(&key, functions.chain(instances).chain(names().map(|n| -> &str { n }))) {
             d = d.help(format!("did you mean `{n}`?"));
         }
@@ -175,7 +200,12 @@ impl<'a> Checker<'a> {
     }
 
     /// Arguments beside their parameters: inputs (with VAR_IN_OUT) and outputs.
-    fn match_call<'e>(&mut self, pou: &Pou, args: &'e [Arg], span: Span) -> Option<(Vec<Matched<'e>>, Vec<Matched<'e>>)> {
+    fn match_call<'e>(
+        &mut self,
+        pou: &Pou,
+        args: &'e [Arg],
+        span: Span,
+    ) -> Option<(Vec<Matched<'e>>, Vec<Matched<'e>>)> {
         let params: Vec<u32> = (0..pou.vars.len() as u32)
             .filter(|i| matches!(pou.vars[*i as usize].section, Section::Input | Section::InOut))
             .collect();
@@ -188,9 +218,17 @@ impl<'a> Checker<'a> {
                 return None;
             }
             if positional != params.len() {
-                let names: Vec<&str> = params.iter().map(|i| pou.vars[*i as usize].name.text.as_str()).collect();
-                let d = Diagnostic::new("E0501", span, format!("{} takes {} inputs, {positional} given", pou.name.text, params.len()))
-                    .help(format!("its inputs: {}", if names.is_empty() { "none".to_owned() } else { names.join(", ") }));
+                let names: Vec<&str> =
+                    params.iter().map(|i| pou.vars[*i as usize].name.text.as_str()).collect();
+                let d = Diagnostic::new(
+                    "E0501",
+                    span,
+                    format!("{} takes {} inputs, {positional} given", pou.name.text, params.len()),
+                )
+                .help(format!(
+                    "its inputs: {}",
+                    if names.is_empty() { "none".to_owned() } else { names.join(", ") }
+                ));
                 self.report(d);
                 return None;
             }
@@ -206,7 +244,11 @@ impl<'a> Checker<'a> {
             };
             let found = pou.by_name.get(&name.key()).copied().filter(|i| {
                 let section = pou.vars[*i as usize].section;
-                if a.output { section == Section::Output } else { matches!(section, Section::Input | Section::InOut) }
+                if a.output {
+                    section == Section::Output
+                } else {
+                    matches!(section, Section::Input | Section::InOut)
+                }
             });
             let Some(i) = found else {
                 self.no_parameter(pou, name, a.output);
@@ -241,11 +283,14 @@ impl<'a> Checker<'a> {
             })
         };
         if matches!(name.key().as_str(), "EN" | "ENO") {
-            self.report(Diagnostic::new("E0904", name.span, "EN and ENO are not supported in ST yet").help("use IF"));
+            self.report(
+                Diagnostic::new("E0904", name.span, "EN and ENO are not supported in ST yet").help("use IF"),
+            );
             return;
         }
         let what = if output { "output" } else { "input" };
-        let mut d = Diagnostic::new("E0502", name.span, format!("{} has no {what} `{}`", pou.name.text, name.text));
+        let mut d =
+            Diagnostic::new("E0502", name.span, format!("{} has no {what} `{}`", pou.name.text, name.text));
         if of(!output).any(|v| v.name.text.eq_ignore_ascii_case(&name.text)) {
             d = d.help(if output { "it is an input: write `:=`" } else { "it is an output: write `=>`" });
         } else if let Some(n) = nearest(&name.key(), of(output).map(|v| v.name.text.as_str())) {
@@ -254,7 +299,13 @@ impl<'a> Checker<'a> {
         self.report(d);
     }
 
-    fn function_call(&mut self, index: u32, pou: &Pou, args: &[Arg], span: Span) -> Option<(Call, Option<Type>)> {
+    fn function_call(
+        &mut self,
+        index: u32,
+        pou: &Pou,
+        args: &[Arg],
+        span: Span,
+    ) -> Option<(Call, Option<Type>)> {
         let (inputs, outputs) = self.match_call(pou, args, span)?;
         self.body.calls.insert(index);
         let mut call_args = Vec::new();
@@ -268,7 +319,11 @@ impl<'a> Checker<'a> {
                 (Section::InOut, Some(e)) => self.reference(v, e).map(CallArg::Address),
                 (_, Some(e)) => self.input(v, e),
                 (Section::InOut, None) => {
-                    let d = Diagnostic::new("E0507", span, format!("VAR_IN_OUT `{}` of {} must be given", v.name.text, pou.name.text));
+                    let d = Diagnostic::new(
+                        "E0507",
+                        span,
+                        format!("VAR_IN_OUT `{}` of {} must be given", v.name.text, pou.name.text),
+                    );
                     self.report(d);
                     None
                 }
@@ -276,7 +331,11 @@ impl<'a> Checker<'a> {
                     (Some(e), InitData::Scalar(c)) => Some(CallArg::Value(Expr::new(e, ExprKind::Const(*c)))),
                     (Some(e), _) => Some(CallArg::Value(self.default_value(e, &v.ty))),
                     (None, _) => {
-                        let d = Diagnostic::new("E0507", span, format!("input `{}` of {} must be given", v.name.text, pou.name.text));
+                        let d = Diagnostic::new(
+                            "E0507",
+                            span,
+                            format!("input `{}` of {} must be given", v.name.text, pou.name.text),
+                        );
                         self.report(d);
                         None
                     }
@@ -310,7 +369,9 @@ impl<'a> Checker<'a> {
     fn input(&mut self, v: &Var, e: &ast::Expr) -> Option<CallArg> {
         let value = self.expr(e, v.ty.elem());
         if v.ty.elem().is_some() {
-            return self.coerce(value, e.span, &v.ty, &format!("input `{}`", v.name.text)).map(CallArg::Value);
+            return self
+                .coerce(value, e.span, &v.ty, &format!("input `{}`", v.name.text))
+                .map(CallArg::Value);
         }
         match value {
             Val::Whole(place, ty) if ty == v.ty => {
@@ -329,7 +390,11 @@ impl<'a> Checker<'a> {
         let (place, ty, access) = match self.place(e) {
             Target::Place(p, t, a) => (p, t, a),
             Target::Const(..) => {
-                let d = Diagnostic::new("E0508", e.span, format!("VAR_IN_OUT `{}` needs a variable, not a constant", v.name.text));
+                let d = Diagnostic::new(
+                    "E0508",
+                    e.span,
+                    format!("VAR_IN_OUT `{}` needs a variable, not a constant", v.name.text),
+                );
                 self.report(d);
                 return None;
             }
@@ -340,19 +405,31 @@ impl<'a> Checker<'a> {
         }
         if ty != v.ty {
             let (want, found) = (self.tables.type_name(&v.ty), self.tables.type_name(&ty));
-            let d = Diagnostic::new("E0401", e.span, format!("VAR_IN_OUT `{}`: a variable of type {want} is needed, found {found}", v.name.text))
-                .help("a reference converts nothing: the types must be the same");
+            let d = Diagnostic::new(
+                "E0401",
+                e.span,
+                format!("VAR_IN_OUT `{}`: a variable of type {want} is needed, found {found}", v.name.text),
+            )
+            .help("a reference converts nothing: the types must be the same");
             self.report(d);
             return None;
         }
         if let Access::ReadOnly(why) = access {
-            let d = Diagnostic::new("E0306", e.span, format!("cannot be given to VAR_IN_OUT `{}`: {why}", v.name.text));
+            let d = Diagnostic::new(
+                "E0306",
+                e.span,
+                format!("cannot be given to VAR_IN_OUT `{}`: {why}", v.name.text),
+            );
             self.report(d);
             return None;
         }
         if place.storage != Storage::Plain {
-            let d = Diagnostic::new("E0508", e.span, format!("a located bit or 32-bit TIME cannot be given to VAR_IN_OUT `{}`", v.name.text))
-                .help("copy it to a variable, call, and copy it back");
+            let d = Diagnostic::new(
+                "E0508",
+                e.span,
+                format!("a located bit or 32-bit TIME cannot be given to VAR_IN_OUT `{}`", v.name.text),
+            )
+            .help("copy it to a variable, call, and copy it back");
             self.report(d);
             return None;
         }
@@ -391,8 +468,9 @@ impl<'a> Checker<'a> {
         let (target, ty) = self.assignable(e)?;
         let (Some(from), Some(to)) = (v.ty.elem(), ty.elem()) else {
             if v.ty != Type::Error {
-                let d = Diagnostic::new("E0905", m.span, "`=>` with arrays and structures is not supported yet")
-                    .help("assign the member after the call");
+                let d =
+                    Diagnostic::new("E0905", m.span, "`=>` with arrays and structures is not supported yet")
+                        .help("assign the member after the call");
                 self.report(d);
             }
             return None;
@@ -401,8 +479,12 @@ impl<'a> Checker<'a> {
         let fits = v.ty == ty || (plain(&ty) && !matches!(v.ty, Type::Enum(_)) && widens(from, to));
         if !fits {
             let (a, b) = (self.tables.type_name(&v.ty), self.tables.type_name(&ty));
-            let d = Diagnostic::new("E0401", e.span, format!("output `{}` is {a} and does not fit {b}", v.name.text))
-                .help("assign it after the call with a conversion");
+            let d = Diagnostic::new(
+                "E0401",
+                e.span,
+                format!("output `{}` is {a} and does not fit {b}", v.name.text),
+            )
+            .help("assign it after the call with a conversion");
             self.report(d);
             return None;
         }
@@ -426,7 +508,11 @@ impl<'a> Checker<'a> {
         let mut good = true;
         for v in pou.vars.iter().filter(|v| v.section == Section::InOut) {
             if !inputs.iter().any(|m| pou.vars[m.var as usize].name == v.name) {
-                let d = Diagnostic::new("E0507", span, format!("VAR_IN_OUT `{}` of {} must be given in every call", v.name.text, pou.name.text));
+                let d = Diagnostic::new(
+                    "E0507",
+                    span,
+                    format!("VAR_IN_OUT `{}` of {} must be given in every call", v.name.text, pou.name.text),
+                );
                 self.report(d);
                 good = false;
             }
@@ -440,7 +526,9 @@ impl<'a> Checker<'a> {
             } else {
                 self.input(v, e).map(|a| match a {
                     CallArg::Value(value) => FbInput::Value { offset: v.offset, value },
-                    CallArg::Address(from) => FbInput::Copy { offset: v.offset, from, bytes: self.tables.size_of(&v.ty) as u32 },
+                    CallArg::Address(from) => {
+                        FbInput::Copy { offset: v.offset, from, bytes: self.tables.size_of(&v.ty) as u32 }
+                    }
                 })
             };
             match store {
@@ -458,7 +546,11 @@ impl<'a> Checker<'a> {
             Target::Place(place, ty, access) => {
                 match access {
                     Access::ReadOnly(why) => {
-                        self.report(Diagnostic::new("E0306", e.span, format!("this cannot be assigned: {why}")));
+                        self.report(Diagnostic::new(
+                            "E0306",
+                            e.span,
+                            format!("this cannot be assigned: {why}"),
+                        ));
                         return None;
                     }
                     Access::OwnInput => self.report(

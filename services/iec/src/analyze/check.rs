@@ -19,8 +19,6 @@ pub enum Val {
     Expr(Expr, Type),
     /// A whole array, structure or function block instance.
     Whole(Place, Type),
-    /// A function without result.
-    Void,
     /// Reported already.
     Error,
 }
@@ -59,6 +57,8 @@ pub struct Checker<'a> {
     pub temp_ranges: Vec<(i128, i128)>,
     /// Only constants are allowed.
     pub constant_only: bool,
+    /// A statement was left out.
+    pub dropped: bool,
 }
 
 impl<'a> Checker<'a> {
@@ -74,6 +74,7 @@ impl<'a> Checker<'a> {
             counters: Vec::new(),
             temp_ranges: Vec::new(),
             constant_only: false,
+            dropped: false,
         }
     }
 
@@ -105,9 +106,11 @@ impl<'a> Checker<'a> {
             _ => None,
         };
         // A subscript that is known at run time only may reach the whole array.
-        let reach: i64 = place.index.iter().flat_map(|i| &i.terms).map(|t| (t.hi - t.lo) * i64::from(t.stride)).sum();
+        let reach: i64 =
+            place.index.iter().flat_map(|i| &i.terms).map(|t| (t.hi - t.lo) * i64::from(t.stride)).sum();
         let bytes = bytes + reach as u32;
-        let used = LocatedUse { statement: self.statement, address: address + place.offset, bytes, bit, write };
+        let used =
+            LocatedUse { statement: self.statement, address: address + place.offset, bytes, bit, write };
         self.body.located.push(used);
     }
 
@@ -137,7 +140,6 @@ impl<'a> Checker<'a> {
             Val::Int(n) => format!("the integer {n}"),
             Val::Real(r, _) => format!("the real number {r}"),
             Val::Expr(_, t) | Val::Whole(_, t) => self.tables.type_name(t),
-            Val::Void => "nothing".to_owned(),
             Val::Error => "?".to_owned(),
         }
     }

@@ -23,7 +23,8 @@ pub fn configure(
     syntax_errors: bool,
     diags: &mut Vec<Diagnostic>,
 ) -> (Vec<TaskInfo>, Vec<InstanceInfo>) {
-    let resources: Vec<&Resource> = units.iter().flat_map(|u| &u.configurations).flat_map(|c| &c.resources).collect();
+    let resources: Vec<&Resource> =
+        units.iter().flat_map(|u| &u.configurations).flat_map(|c| &c.resources).collect();
     if let [first, second, ..] = resources.as_slice() {
         let d = Diagnostic::new("E0701", second.name.span, "more than one RESOURCE")
             .also(first.name.span, "the first one")
@@ -37,7 +38,13 @@ pub fn configure(
 }
 
 /// One instance of each program, all in one task.
-fn implicit(units: &[ast::Unit], tables: &Tables, options: &Options, syntax_errors: bool, diags: &mut Vec<Diagnostic>) -> (Vec<TaskInfo>, Vec<InstanceInfo>) {
+fn implicit(
+    units: &[ast::Unit],
+    tables: &Tables,
+    options: &Options,
+    syntax_errors: bool,
+    diags: &mut Vec<Diagnostic>,
+) -> (Vec<TaskInfo>, Vec<InstanceInfo>) {
     let mut instances = Vec::new();
     for (i, p) in tables.pous.iter().enumerate() {
         if p.kind == PouKind::Program {
@@ -46,7 +53,9 @@ fn implicit(units: &[ast::Unit], tables: &Tables, options: &Options, syntax_erro
     }
     if instances.is_empty() && !syntax_errors && diags.iter().all(|d| d.code.starts_with('W')) {
         let d = match units.iter().flat_map(|u| &u.configurations).next() {
-            Some(c) => Diagnostic::new("E0702", c.name.span, "the CONFIGURATION has no RESOURCE with a PROGRAM"),
+            Some(c) => {
+                Diagnostic::new("E0702", c.name.span, "the CONFIGURATION has no RESOURCE with a PROGRAM")
+            }
             None => Diagnostic::placeless("E0702", "there is no PROGRAM in the sources"),
         };
         diags.push(d.help("add PROGRAM name ... END_PROGRAM"));
@@ -79,13 +88,20 @@ impl Config<'_> {
                 let d = Diagnostic::new(
                     "E0703",
                     t.name.span,
-                    format!("the sources declare a TASK and the stack file gives `cycle` ({} ms)", ns as f64 / 1e6),
+                    format!(
+                        "the sources declare a TASK and the stack file gives `cycle` ({} ms)",
+                        ns as f64 / 1e6
+                    ),
                 )
                 .help("remove one of the two: `cycle` makes the task of programs that have none");
                 self.diags.push(d);
             }
             if tasks.len() >= limits::TASKS {
-                self.diags.push(Diagnostic::new("E0803", t.name.span, format!("more than {} tasks", limits::TASKS)));
+                self.diags.push(Diagnostic::new(
+                    "E0803",
+                    t.name.span,
+                    format!("more than {} tasks", limits::TASKS),
+                ));
                 break;
             }
             tasks.push(self.task(t));
@@ -104,8 +120,9 @@ impl Config<'_> {
                 continue;
             }
             if let Some(span) = p.args {
-                let d = Diagnostic::new("E0905", span, "parameters of program instances are not supported yet")
-                    .help("use located or global variables");
+                let d =
+                    Diagnostic::new("E0905", span, "parameters of program instances are not supported yet")
+                        .help("use located or global variables");
                 self.diags.push(d);
             }
             let Some(pou) = self.program(&p.type_name) else { continue };
@@ -114,8 +131,9 @@ impl Config<'_> {
             self.attach(&mut tasks, p, index);
         }
         if instances.is_empty() && !self.syntax_errors && self.diags.iter().all(|d| d.code.starts_with('W')) {
-            let d = Diagnostic::new("E0702", r.name.span, format!("RESOURCE {} runs no PROGRAM", r.name.text))
-                .help("add PROGRAM instance WITH task : type;");
+            let d =
+                Diagnostic::new("E0702", r.name.span, format!("RESOURCE {} runs no PROGRAM", r.name.text))
+                    .help("add PROGRAM instance WITH task : type;");
             self.diags.push(d);
         }
         self.unused(&instances);
@@ -127,7 +145,8 @@ impl Config<'_> {
         if let Some(i) = found.filter(|i| self.tables.pous[*i as usize].kind == PouKind::Program) {
             return Some(i);
         }
-        let programs = self.tables.pous.iter().filter(|p| p.kind == PouKind::Program).map(|p| p.name.text.as_str());
+        let programs =
+            self.tables.pous.iter().filter(|p| p.kind == PouKind::Program).map(|p| p.name.text.as_str());
         let near = super::resolve::nearest(&name.key(), programs);
         let mut d = Diagnostic::new("E0704", name.span, format!("there is no PROGRAM `{}`", name.text));
         if let Some(n) = near {
@@ -169,12 +188,22 @@ impl Config<'_> {
     }
 
     fn task(&mut self, t: &TaskDecl) -> TaskInfo {
-        let mut task = TaskInfo { name: t.name.text.clone(), priority: 0, interval_ns: None, single: None, programs: Vec::new() };
+        let mut task = TaskInfo {
+            name: t.name.text.clone(),
+            priority: 0,
+            interval_ns: None,
+            single: None,
+            programs: Vec::new(),
+        };
         let mut seen: Vec<String> = Vec::new();
         for (name, value) in &t.params {
             let key = name.key();
             if seen.contains(&key) {
-                self.diags.push(Diagnostic::new("E0503", name.span, format!("`{}` is given twice", name.text)));
+                self.diags.push(Diagnostic::new(
+                    "E0503",
+                    name.span,
+                    format!("`{}` is given twice", name.text),
+                ));
                 continue;
             }
             match key.as_str() {
@@ -215,7 +244,10 @@ impl Config<'_> {
                 None
             }
             None => {
-                self.diags.push(Diagnostic::new("E0705", e.span, "INTERVAL must be a constant duration").help("write INTERVAL := T#10ms"));
+                self.diags.push(
+                    Diagnostic::new("E0705", e.span, "INTERVAL must be a constant duration")
+                        .help("write INTERVAL := T#10ms"),
+                );
                 None
             }
         }
@@ -230,7 +262,11 @@ impl Config<'_> {
         };
         let found = n.and_then(|n| u32::try_from(n).ok()).filter(|n| *n <= LOWEST);
         if found.is_none() {
-            self.diags.push(Diagnostic::new("E0705", e.span, format!("PRIORITY must be a constant from 0 (highest) to {LOWEST}")));
+            self.diags.push(Diagnostic::new(
+                "E0705",
+                e.span,
+                format!("PRIORITY must be a constant from 0 (highest) to {LOWEST}"),
+            ));
         }
         found
     }
@@ -238,7 +274,9 @@ impl Config<'_> {
     /// SINGLE names a global BOOL.
     fn single(&mut self, e: &Expr) -> Option<String> {
         let global = match &e.kind {
-            ExprKind::Name(n) => self.tables.globals_by_name.get(&n.key()).map(|g| &self.tables.globals[*g as usize]),
+            ExprKind::Name(n) => {
+                self.tables.globals_by_name.get(&n.key()).map(|g| &self.tables.globals[*g as usize])
+            }
             _ => None,
         };
         match global {
@@ -256,8 +294,9 @@ impl Config<'_> {
     fn unused(&mut self, instances: &[InstanceInfo]) {
         for (i, p) in self.tables.pous.iter().enumerate() {
             if p.kind == PouKind::Program && !instances.iter().any(|x| x.pou == i as u32) {
-                let d = Diagnostic::new("W0207", p.name.span, format!("PROGRAM {} is never run", p.name.text))
-                    .help("add an instance to the RESOURCE");
+                let d =
+                    Diagnostic::new("W0207", p.name.span, format!("PROGRAM {} is never run", p.name.text))
+                        .help("add an instance to the RESOURCE");
                 self.diags.push(d);
             }
         }

@@ -55,7 +55,11 @@ impl Checker<'_> {
             (Some(from), v) => self.coerce(v, span, &Type::Elem(from), "argument"),
             (None, v) => {
                 let hint = if c.trunc { Some(ElemType::Lreal) } else { None };
-                let v = if c.trunc && matches!(v, Val::Int(_)) { self.to_real(v, span, ElemType::Lreal).map_or(Val::Error, Val::elem) } else { v };
+                let v = if c.trunc && matches!(v, Val::Int(_)) {
+                    self.as_real(v, span, ElemType::Lreal).map_or(Val::Error, Val::elem)
+                } else {
+                    v
+                };
                 self.literal_default(&v, span, hint)
             }
         };

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use super::resolve::{Resolver, locate};
+use super::resolve::Resolver;
 use super::tables::{InitData, Pou, Tables, Var};
 use crate::diagnostic::{Diagnostic, Span};
 use crate::syntax::ast::{self, Ident, PouKind, Section, TypeDecl, TypeSpec, TypeSpecKind, VarBlock};
@@ -25,7 +25,15 @@ pub fn declare<'u>(
     tables: &mut Tables,
     diags: &mut Vec<Diagnostic>,
 ) -> Vec<&'u ast::Pou> {
-    let mut d = Declare { options, tables, diags, decls: Vec::new(), types: HashMap::new(), fb_state: Vec::new(), path: Vec::new() };
+    let mut d = Declare {
+        options,
+        tables,
+        diags,
+        decls: Vec::new(),
+        types: HashMap::new(),
+        fb_state: Vec::new(),
+        path: Vec::new(),
+    };
     for (index, unit) in units.iter().enumerate() {
         for pou in &unit.pous {
             d.enter_pou(pou, index == library);
@@ -34,9 +42,10 @@ pub fn declare<'u>(
     let blocks: Vec<&VarBlock> = units
         .iter()
         .flat_map(|u| {
-            let inner = u.configurations.iter().flat_map(|c| {
-                c.globals.iter().chain(c.resources.iter().flat_map(|r| r.globals.iter()))
-            });
+            let inner = u
+                .configurations
+                .iter()
+                .flat_map(|c| c.globals.iter().chain(c.resources.iter().flat_map(|r| r.globals.iter())));
             u.globals.iter().chain(inner)
         })
         .collect();
@@ -72,10 +81,10 @@ fn sorted(mut names: Vec<String>) -> Vec<String> {
     names
 }
 
-struct Declare<'u, 'a> {
-    options: &'a Options,
-    tables: &'a mut Tables,
-    diags: &'a mut Vec<Diagnostic>,
+pub(super) struct Declare<'u, 'a> {
+    pub(super) options: &'a Options,
+    pub(super) tables: &'a mut Tables,
+    pub(super) diags: &'a mut Vec<Diagnostic>,
     decls: Vec<&'u ast::Pou>,
     types: HashMap<String, (&'u TypeDecl, State)>,
     fb_state: Vec<State>,
@@ -89,7 +98,11 @@ impl<'u> Declare<'u, '_> {
         if let Some(&first) = self.tables.pous_by_name.get(&key) {
             let first = &self.tables.pous[first as usize];
             if library {
-                let d = Diagnostic::new("W0103", first.name.span, format!("`{}` hides the standard block of this name", first.name.text));
+                let d = Diagnostic::new(
+                    "W0103",
+                    first.name.span,
+                    format!("`{}` hides the standard block of this name", first.name.text),
+                );
                 self.diags.push(d);
             } else {
                 self.diags.push(super::duplicate(&pou.name.text, first.name.span, pou.name.span));
@@ -97,8 +110,9 @@ impl<'u> Declare<'u, '_> {
             return;
         }
         if elementary(&key).is_some() || (!library && super::builtins::is_builtin(&key)) {
-            let d = Diagnostic::new("E0203", pou.name.span, format!("`{}` is a standard name", pou.name.text))
-                .help("choose another name");
+            let d =
+                Diagnostic::new("E0203", pou.name.span, format!("`{}` is a standard name", pou.name.text))
+                    .help("choose another name");
             self.diags.push(d);
         }
         let index = self.tables.pous.len() as u32;
@@ -130,7 +144,11 @@ impl<'u> Declare<'u, '_> {
             let first = self.tables.pous[pou as usize].name.span;
             self.diags.push(super::duplicate(&t.name.text, first, t.name.span));
         } else if elementary(&key).is_some() {
-            self.diags.push(Diagnostic::new("E0203", t.name.span, format!("`{}` is a standard name", t.name.text)));
+            self.diags.push(Diagnostic::new(
+                "E0203",
+                t.name.span,
+                format!("`{}` is a standard name", t.name.text),
+            ));
         } else {
             self.types.insert(key, (t, State::Open));
         }
@@ -153,7 +171,11 @@ impl<'u> Declare<'u, '_> {
                 false
             }
             State::Open if self.path.len() >= limits::INSTANCE_DEPTH as usize => {
-                let d = Diagnostic::new("E0801", name.span, format!("types are nested more than {} deep", limits::INSTANCE_DEPTH));
+                let d = Diagnostic::new(
+                    "E0801",
+                    name.span,
+                    format!("types are nested more than {} deep", limits::INSTANCE_DEPTH),
+                );
                 self.diags.push(d);
                 false
             }
@@ -186,7 +208,7 @@ impl<'u> Declare<'u, '_> {
     }
 
     /// Completes what a specification names.
-    fn complete_spec(&mut self, spec: &TypeSpec) {
+    pub(super) fn complete_spec(&mut self, spec: &TypeSpec) {
         match &spec.kind {
             TypeSpecKind::Named(name) => self.complete_name(name),
             TypeSpecKind::Array { of, .. } => self.complete_spec(of),
@@ -253,7 +275,11 @@ impl<'u> Declare<'u, '_> {
         bytes = bytes.next_multiple_of(u64::from(align)).max(1);
         let p = &mut self.tables.pous[pou as usize];
         if bytes > limits::MEMORY_BYTES {
-            let d = Diagnostic::new("E0805", p.name.span, format!("one instance of `{}` has {bytes} bytes", p.name.text));
+            let d = Diagnostic::new(
+                "E0805",
+                p.name.span,
+                format!("one instance of `{}` has {bytes} bytes", p.name.text),
+            );
             self.diags.push(d);
             bytes = 1;
         }
@@ -262,97 +288,6 @@ impl<'u> Declare<'u, '_> {
         }
         p.bytes = bytes as u32;
         p.align = align;
-    }
-
-    /// Global variables: constants of elementary types first, everything else in a second pass.
-    fn globals(&mut self, blocks: &[&VarBlock], constants: bool) {
-        for block in blocks {
-            for decl in &block.vars {
-                let early = block.constant && matches!(&decl.spec.kind, TypeSpecKind::Named(n) if elementary(&n.text).is_some());
-                if early != constants {
-                    continue;
-                }
-                self.complete_spec(&decl.spec);
-                for var in self.variable(block, decl, None) {
-                    self.enter_global(var);
-                }
-            }
-        }
-    }
-
-    fn enter_global(&mut self, var: Var) {
-        let key = var.name.key();
-        if let Some(&first) = self.tables.globals_by_name.get(&key) {
-            let first = &self.tables.globals[first as usize];
-            self.diags.push(super::duplicate(&var.name.text, first.name.span, var.name.span));
-            return;
-        }
-        if let Some(&pou) = self.tables.pous_by_name.get(&key)
-            && !self.tables.pous[pou as usize].library
-        {
-            let first = self.tables.pous[pou as usize].name.span;
-            self.diags.push(super::duplicate(&var.name.text, first, var.name.span));
-            return;
-        }
-        self.tables.globals_by_name.insert(key, self.tables.globals.len() as u32);
-        self.tables.globals.push(var);
-    }
-
-    /// VAR_GLOBAL made from the stack file's symbols.
-    fn mapped_symbols(&mut self) {
-        for symbol in &self.options.externals {
-            let fail = |text: String| Diagnostic::placeless("E0604", format!("{}: symbol `{}`: {text}", symbol.origin, symbol.name));
-            let valid = symbol.name.chars().enumerate().all(|(i, c)| c == '_' || c.is_ascii_alphabetic() || (i > 0 && c.is_ascii_digit()));
-            let (tokens, problems) = crate::lexer::lex(0, &symbol.name);
-            let is_word = problems.is_empty()
-                && tokens.len() == 2
-                && tokens[0].kind == crate::lexer::TokenKind::Word(None)
-                && elementary(&symbol.name).is_none();
-            if !valid || !is_word || symbol.name.len() > limits::IDENT_CHARS {
-                self.diags.push(fail("is no name of a variable (letters, digits, `_`, no reserved word)".to_owned()));
-                continue;
-            }
-            let Some(elem) = elementary(&symbol.type_name) else {
-                self.diags.push(fail(format!("`{}` is no elementary type", symbol.type_name)));
-                continue;
-            };
-            let located = match locate(self.tables, &symbol.address, &Type::Elem(elem)) {
-                Ok(l) => l,
-                Err((_, message)) => {
-                    self.diags.push(fail(message));
-                    continue;
-                }
-            };
-            let key = symbol.name.to_ascii_uppercase();
-            if let Some(&first) = self.tables.globals_by_name.get(&key) {
-                let first = &self.tables.globals[first as usize];
-                let d = match &first.mapped {
-                    Some(origin) => fail(format!("is declared at {origin} already")),
-                    None => Diagnostic::new("E0604", first.name.span, format!("`{}` is also the symbol of {}", first.name.text, symbol.origin))
-                        .help("remove this declaration: the stack file makes the variable; in a POU use VAR_EXTERNAL or the plain name"),
-                };
-                self.diags.push(d);
-                continue;
-            }
-            if self.tables.pous_by_name.get(&key).is_some_and(|p| !self.tables.pous[*p as usize].library) {
-                self.diags.push(fail("is the name of a POU".to_owned()));
-                continue;
-            }
-            self.tables.globals_by_name.insert(key, self.tables.globals.len() as u32);
-            self.tables.globals.push(Var {
-                name: Ident { text: symbol.name.clone(), span: Span::default() },
-                section: Section::Global,
-                ty: Type::Elem(elem),
-                init: InitData::Default,
-                constant: false,
-                value: None,
-                retain: false,
-                located: Some(located),
-                external: None,
-                offset: 0,
-                mapped: Some(symbol.origin.clone()),
-            });
-        }
     }
 
     /// All variables of a POU, and a function's result.
@@ -375,8 +310,12 @@ impl<'u> Declare<'u, '_> {
                 let (ty, _) = self.resolver().spec(spec, None);
                 if ty.elem().is_none() && ty != Type::Error {
                     let name = self.tables.type_name(&ty);
-                    let d = Diagnostic::new("E0905", spec.span, format!("functions that return {name} are not supported yet"))
-                        .help("use a VAR_IN_OUT parameter");
+                    let d = Diagnostic::new(
+                        "E0905",
+                        spec.span,
+                        format!("functions that return {name} are not supported yet"),
+                    )
+                    .help("use a VAR_IN_OUT parameter");
                     self.diags.push(d);
                     return Type::Error;
                 }
@@ -395,19 +334,28 @@ impl<'u> Declare<'u, '_> {
             return;
         }
         if p.kind == PouKind::Function && p.name.key() == key {
-            let d = Diagnostic::new("E0301", var.name.span, format!("`{}` is the name of the function itself", var.name.text))
-                .also(p.name.span, "this function");
+            let d = Diagnostic::new(
+                "E0301",
+                var.name.span,
+                format!("`{}` is the name of the function itself", var.name.text),
+            )
+            .also(p.name.span, "this function");
             self.diags.push(d);
             return;
         }
         if elementary(&key).is_some() {
-            let d = Diagnostic::new("E0203", var.name.span, format!("`{}` is the name of a type", var.name.text))
-                .help("choose another name");
+            let d =
+                Diagnostic::new("E0203", var.name.span, format!("`{}` is the name of a type", var.name.text))
+                    .help("choose another name");
             self.diags.push(d);
             return;
         }
         if p.vars.len() >= limits::VARIABLES {
-            let d = Diagnostic::new("E0803", var.name.span, format!("more than {} variables in one POU", limits::VARIABLES));
+            let d = Diagnostic::new(
+                "E0803",
+                var.name.span,
+                format!("more than {} variables in one POU", limits::VARIABLES),
+            );
             self.diags.push(d);
             return;
         }
@@ -417,13 +365,22 @@ impl<'u> Declare<'u, '_> {
 
     fn check_section(&mut self, kind: PouKind, block: &VarBlock) {
         let bad = |what: &str, help: &str| {
-            Some(Diagnostic::new("E0305", block.span, format!("{what} is not allowed in a {}", kind.keyword())).help(help))
+            Some(
+                Diagnostic::new(
+                    "E0305",
+                    block.span,
+                    format!("{what} is not allowed in a {}", kind.keyword()),
+                )
+                .help(help),
+            )
         };
         let section = block.section.keyword();
         let mut d = match (kind, block.section) {
             (_, Section::Global) => bad("VAR_GLOBAL", "put it at file level or into the CONFIGURATION"),
-            (PouKind::Program, Section::InOut) => Some(Diagnostic::new("E0905", block.span, "VAR_IN_OUT of a PROGRAM is not supported")
-                .help("use VAR_EXTERNAL or a global variable")),
+            (PouKind::Program, Section::InOut) => Some(
+                Diagnostic::new("E0905", block.span, "VAR_IN_OUT of a PROGRAM is not supported")
+                    .help("use VAR_EXTERNAL or a global variable"),
+            ),
             _ => None,
         };
         if block.constant && !matches!(block.section, Section::Var | Section::Global | Section::External) {
@@ -432,10 +389,17 @@ impl<'u> Declare<'u, '_> {
         if let Some(span) = block.retain {
             d = match kind {
                 PouKind::Function => bad("RETAIN", "a function keeps nothing between calls"),
-                PouKind::FunctionBlock => Some(Diagnostic::new("E0905", span, "RETAIN inside a FUNCTION_BLOCK is not supported yet")
-                    .help("declare the whole instance RETAIN where it is declared")),
-                PouKind::Program if block.constant || matches!(block.section, Section::Temp | Section::External) => {
-                    bad(&format!("{section} RETAIN"), "RETAIN belongs to VAR, VAR_INPUT, VAR_OUTPUT and VAR_GLOBAL")
+                PouKind::FunctionBlock => Some(
+                    Diagnostic::new("E0905", span, "RETAIN inside a FUNCTION_BLOCK is not supported yet")
+                        .help("declare the whole instance RETAIN where it is declared"),
+                ),
+                PouKind::Program
+                    if block.constant || matches!(block.section, Section::Temp | Section::External) =>
+                {
+                    bad(
+                        &format!("{section} RETAIN"),
+                        "RETAIN belongs to VAR, VAR_INPUT, VAR_OUTPUT and VAR_GLOBAL",
+                    )
                 }
                 PouKind::Program => d,
             };
@@ -444,7 +408,7 @@ impl<'u> Declare<'u, '_> {
     }
 
     /// The variables of one declaration; `pou`: whose.
-    fn variable(&mut self, block: &VarBlock, decl: &ast::VarDecl, pou: Option<u32>) -> Vec<Var> {
+    pub(super) fn variable(&mut self, block: &VarBlock, decl: &ast::VarDecl, pou: Option<u32>) -> Vec<Var> {
         let kind = pou.map(|p| self.decls[p as usize].kind);
         // Earlier constants of the POU are visible in bounds and initial values: it is lent out meanwhile.
         let scope = pou.map(|p| self.lend(p));
@@ -458,17 +422,28 @@ impl<'u> Declare<'u, '_> {
     /// Takes a POU out of the tables; a shell of the same name stays.
     fn lend(&mut self, pou: u32) -> Pou {
         let p = &mut self.tables.pous[pou as usize];
-        let shell = Pou { vars: Vec::new(), by_name: HashMap::new(), returns: None, name: p.name.clone(), ..*p };
+        let shell =
+            Pou { vars: Vec::new(), by_name: HashMap::new(), returns: None, name: p.name.clone(), ..*p };
         std::mem::replace(p, shell)
     }
 
-    fn variable_in(&mut self, block: &VarBlock, decl: &ast::VarDecl, kind: Option<PouKind>, scope: Option<&Pou>) -> Vec<Var> {
+    fn variable_in(
+        &mut self,
+        block: &VarBlock,
+        decl: &ast::VarDecl,
+        kind: Option<PouKind>,
+        scope: Option<&Pou>,
+    ) -> Vec<Var> {
         let mut r = self.resolver();
         let (ty, type_init) = r.spec(&decl.spec, scope);
         let init = match &decl.init {
             Some(i) if block.section == Section::External || block.section == Section::InOut => {
-                let d = Diagnostic::new("E0310", i.span(), format!("{} has no initial value", block.section.keyword()))
-                    .help("the variable it refers to has one");
+                let d = Diagnostic::new(
+                    "E0310",
+                    i.span(),
+                    format!("{} has no initial value", block.section.keyword()),
+                )
+                .help("the variable it refers to has one");
                 r.diags.push(d);
                 InitData::Default
             }
@@ -476,9 +451,17 @@ impl<'u> Declare<'u, '_> {
             None => type_init,
         };
         let located = decl.at.as_ref().and_then(|at| match (kind, block.section) {
-            (None, _) | (Some(PouKind::Program | PouKind::FunctionBlock), Section::Var) if !block.constant => r.located(at, &ty),
+            (None, _) | (Some(PouKind::Program | PouKind::FunctionBlock), Section::Var)
+                if !block.constant =>
+            {
+                r.located(at, &ty)
+            }
             _ => {
-                r.diags.push(Diagnostic::new("E0605", at.span, "AT is allowed in VAR of a PROGRAM or FUNCTION_BLOCK and in VAR_GLOBAL only"));
+                r.diags.push(Diagnostic::new(
+                    "E0605",
+                    at.span,
+                    "AT is allowed in VAR of a PROGRAM or FUNCTION_BLOCK and in VAR_GLOBAL only",
+                ));
                 None
             }
         });
@@ -490,7 +473,8 @@ impl<'u> Declare<'u, '_> {
         }
         self.check_type(block, decl, &ty, kind);
         if block.constant && decl.init.is_none() && block.section != Section::External && ty != Type::Error {
-            let d = Diagnostic::new("E0308", decl.spec.span, "a CONSTANT needs a value").help("add `:= value`");
+            let d =
+                Diagnostic::new("E0308", decl.spec.span, "a CONSTANT needs a value").help("add `:= value`");
             self.diags.push(d);
         }
         let value = match (&init, block.constant, ty.elem()) {
@@ -536,43 +520,10 @@ impl<'u> Declare<'u, '_> {
         match ty {
             Type::Fb(_) => true,
             Type::Array(a) => self.contains_fb(&a.of),
-            Type::Struct(s) => self.tables.structs[*s as usize].fields.iter().any(|f| self.contains_fb(&f.ty)),
+            Type::Struct(s) => {
+                self.tables.structs[*s as usize].fields.iter().any(|f| self.contains_fb(&f.ty))
+            }
             _ => false,
-        }
-    }
-
-    fn link_externals(&mut self, pou: usize) {
-        let mut links = Vec::new();
-        for (i, v) in self.tables.pous[pou].vars.iter().enumerate() {
-            if v.section != Section::External {
-                continue;
-            }
-            let Some(&g) = self.tables.globals_by_name.get(&v.name.key()) else {
-                let names = self.tables.globals.iter().map(|g| g.name.text.as_str());
-                let near = super::resolve::nearest(&v.name.key(), names);
-                let d = Diagnostic::new("E0307", v.name.span, format!("there is no VAR_GLOBAL `{}`", v.name.text)).help(
-                    near.map_or_else(|| "declare it in VAR_GLOBAL, or give the stack file a `symbol`".to_owned(), |n| format!("did you mean `{n}`?")),
-                );
-                self.diags.push(d);
-                continue;
-            };
-            let global = &self.tables.globals[g as usize];
-            if global.ty != v.ty && v.ty != Type::Error && global.ty != Type::Error {
-                let (here, there) = (self.tables.type_name(&v.ty), self.tables.type_name(&global.ty));
-                let mut d = Diagnostic::new("E0307", v.name.span, format!("`{}` is {there}, not {here}", v.name.text));
-                d = match &global.mapped {
-                    Some(origin) => d.help(format!("it is the symbol of {origin}")),
-                    None => d.also(global.name.span, "declared here"),
-                };
-                self.diags.push(d);
-            }
-            links.push((i, g, global.constant, global.value));
-        }
-        for (i, g, constant, value) in links {
-            let v = &mut self.tables.pous[pou].vars[i];
-            v.external = Some(g);
-            v.constant |= constant;
-            v.value = value;
         }
     }
 }

@@ -23,13 +23,14 @@ impl Checker<'_> {
                 Val::Error
             }
             ast::ExprKind::Typed(prefix, rest) => self.typed(prefix, rest, e.span),
-            ast::ExprKind::Name(_) | ast::ExprKind::Direct(_) | ast::ExprKind::Field(..) | ast::ExprKind::Index(..) => {
-                match self.place(e) {
-                    Target::Place(place, ty, _) => self.load(place, &ty),
-                    Target::Const(c, ty) => constant(c, ty),
-                    Target::Error => Val::Error,
-                }
-            }
+            ast::ExprKind::Name(_)
+            | ast::ExprKind::Direct(_)
+            | ast::ExprKind::Field(..)
+            | ast::ExprKind::Index(..) => match self.place(e) {
+                Target::Place(place, ty, _) => self.load(place, &ty),
+                Target::Const(c, ty) => constant(c, ty),
+                Target::Error => Val::Error,
+            },
             ast::ExprKind::Call(callee, args) => self.call(callee, args, e.span, want),
             ast::ExprKind::Unary(op, operand) => self.unary(*op, operand, e.span, want),
             ast::ExprKind::Binary(op, a, b, op_span) => self.binary(*op, a, b, *op_span, want),
@@ -57,7 +58,9 @@ impl Checker<'_> {
             };
         }
         if let Some(elem) = elementary(&key) {
-            if elem == ElemType::Bool && (rest.eq_ignore_ascii_case("TRUE") || rest.eq_ignore_ascii_case("FALSE")) {
+            if elem == ElemType::Bool
+                && (rest.eq_ignore_ascii_case("TRUE") || rest.eq_ignore_ascii_case("FALSE"))
+            {
                 return Val::bool(rest.eq_ignore_ascii_case("TRUE"));
             }
             let value = if elem.is_real() && !rest.contains('#') {
@@ -87,9 +90,28 @@ impl Checker<'_> {
                 self.report(d);
                 return Val::Error;
             }
-            return self.error("E0103", prefix.span, format!("literals of type `{}` are not supported", prefix.text));
+            return self.error(
+                "E0103",
+                prefix.span,
+                format!("literals of type `{}` are not supported", prefix.text),
+            );
         }
-        let unsupported = ["STRING", "WSTRING", "CHAR", "WCHAR", "D", "DATE", "TOD", "TIME_OF_DAY", "DT", "DATE_AND_TIME", "LD", "LDATE", "LTOD", "LDT"];
+        let unsupported = [
+            "STRING",
+            "WSTRING",
+            "CHAR",
+            "WCHAR",
+            "D",
+            "DATE",
+            "TOD",
+            "TIME_OF_DAY",
+            "DT",
+            "DATE_AND_TIME",
+            "LD",
+            "LDATE",
+            "LTOD",
+            "LDT",
+        ];
         if unsupported.contains(&key.as_str()) {
             return self.error("E0906", span, format!("literals of type {key} are not supported yet"));
         }
@@ -103,13 +125,19 @@ impl Checker<'_> {
             (Unary::Plus, v @ (Val::Int(_) | Val::Real(..))) => v,
             (Unary::Neg, Val::Int(v)) => self.literal_in_range(-v, span),
             (Unary::Neg, Val::Real(d, f)) => Val::Real(-d, -f),
-            (Unary::Neg, Val::Expr(e, _)) if (e.ty.is_num() && (e.ty.is_real() || e.ty.is_signed())) || e.ty == ElemType::Time => {
+            (Unary::Neg, Val::Expr(e, _))
+                if (e.ty.is_num() && (e.ty.is_real() || e.ty.is_signed())) || e.ty == ElemType::Time =>
+            {
                 let ty = e.ty;
                 Val::elem(fold(Expr::new(ty, ExprKind::Unary(crate::ir::UnOp::Neg, Box::new(e)))))
             }
             (Unary::Neg, Val::Expr(e, _)) if e.ty.is_int() => {
-                let d = Diagnostic::new("E0402", span, format!("`-` of {}, which holds no negative values", e.ty.name()))
-                    .help("convert to a signed type first, for example UINT_TO_DINT(x)");
+                let d = Diagnostic::new(
+                    "E0402",
+                    span,
+                    format!("`-` of {}, which holds no negative values", e.ty.name()),
+                )
+                .help("convert to a signed type first, for example UINT_TO_DINT(x)");
                 self.report(d);
                 Val::Error
             }
@@ -124,7 +152,9 @@ impl Checker<'_> {
             (Unary::Not, Val::Int(v)) if want.is_some_and(|w| w.is_any_bit()) => {
                 let ty = Type::Elem(want.unwrap_or(ElemType::Bool));
                 match self.coerce(Val::Int(v), operand.span, &ty, "operand") {
-                    Some(e) => Val::elem(fold(Expr::new(e.ty, ExprKind::Unary(crate::ir::UnOp::Not, Box::new(e))))),
+                    Some(e) => {
+                        Val::elem(fold(Expr::new(e.ty, ExprKind::Unary(crate::ir::UnOp::Not, Box::new(e)))))
+                    }
                     None => Val::Error,
                 }
             }
@@ -142,9 +172,15 @@ impl Checker<'_> {
         let mut d = Diagnostic::new("E0402", span, format!("`{op}` cannot take {what}"));
         if let Val::Expr(e, _) = v {
             if e.ty.is_bits() && !matches!(op, "NOT" | "AND" | "OR" | "XOR") {
-                d = d.help(format!("bit strings are not numbers: convert, for example {}_TO_UDINT(x)", e.ty.name()));
+                d = d.help(format!(
+                    "bit strings are not numbers: convert, for example {}_TO_UDINT(x)",
+                    e.ty.name()
+                ));
             } else if e.ty.is_int() && matches!(op, "NOT" | "AND" | "OR" | "XOR") {
-                d = d.help(format!("integers are not bit strings: convert, for example {}_TO_DWORD(x)", e.ty.name()));
+                d = d.help(format!(
+                    "integers are not bit strings: convert, for example {}_TO_DWORD(x)",
+                    e.ty.name()
+                ));
             }
         }
         self.report(d);
@@ -179,7 +215,11 @@ impl Checker<'_> {
                 if let Some(c) = e.as_int() {
                     let c = crate::ir::value(s.base, c);
                     if c < s.lo || c > s.hi {
-                        let d = Diagnostic::new("E0404", span, format!("{c} is outside of the subrange {}..{}", s.lo, s.hi));
+                        let d = Diagnostic::new(
+                            "E0404",
+                            span,
+                            format!("{c} is outside of the subrange {}..{}", s.lo, s.hi),
+                        );
                         self.report(d);
                         return None;
                     }
@@ -233,7 +273,7 @@ impl Checker<'_> {
                 }
             },
             Val::Expr(e, ty) => {
-                if let Some(widened) = self.widen(e.clone(), to) {
+                if let Some(widened) = Self::widen(e.clone(), to) {
                     return Some(widened);
                 }
                 let help = Some(format!("convert with {}_TO_{}", e.ty.name(), to.name()));
@@ -261,7 +301,7 @@ impl Checker<'_> {
     }
 
     /// Implicit conversion, if the standard has one.
-    pub fn widen(&mut self, e: Expr, to: ElemType) -> Option<Expr> {
+    pub fn widen(e: Expr, to: ElemType) -> Option<Expr> {
         if e.ty == to {
             return Some(e);
         }

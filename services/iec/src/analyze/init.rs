@@ -22,8 +22,12 @@ impl Resolver<'_> {
             }
             (Type::Struct(_) | Type::Fb(_), Init::Struct(members, _)) => self.init_members(members, ty, pou),
             (Type::Struct(_) | Type::Fb(_), other) => {
-                let d = Diagnostic::new("E0408", other.span(), "a structure or instance is initialised member by member")
-                    .help("write (name := value, ...)");
+                let d = Diagnostic::new(
+                    "E0408",
+                    other.span(),
+                    "a structure or instance is initialised member by member",
+                )
+                .help("write (name := value, ...)");
                 self.diags.push(d);
                 InitData::Default
             }
@@ -31,7 +35,8 @@ impl Resolver<'_> {
             (_, Init::Struct(members, _)) if members.is_empty() => InitData::Default,
             (_, other) => {
                 let name = self.tables.type_name(ty);
-                let d = Diagnostic::new("E0408", other.span(), format!("{name} is initialised with one value"));
+                let d =
+                    Diagnostic::new("E0408", other.span(), format!("{name} is initialised with one value"));
                 self.diags.push(d);
                 InitData::Default
             }
@@ -61,7 +66,13 @@ impl Resolver<'_> {
         result
     }
 
-    fn init_array(&mut self, items: &[(Option<Expr>, Init)], span: Span, a: &ArrayType, pou: Option<&Pou>) -> InitData {
+    fn init_array(
+        &mut self,
+        items: &[(Option<Expr>, Init)],
+        span: Span,
+        a: &ArrayType,
+        pou: Option<&Pou>,
+    ) -> InitData {
         let total = u64::from(a.elements());
         let mut out = Vec::new();
         let mut count: u64 = 0;
@@ -80,8 +91,12 @@ impl Resolver<'_> {
             let value = self.init(item, &a.of, pou);
             count += n;
             if count > total {
-                let d = Diagnostic::new("E0408", span, format!("the list has {count} or more values, the array {total} elements"))
-                    .help("leave values out or make the array larger");
+                let d = Diagnostic::new(
+                    "E0408",
+                    span,
+                    format!("the list has {count} or more values, the array {total} elements"),
+                )
+                .help("leave values out or make the array larger");
                 self.diags.push(d);
                 break;
             }
@@ -118,7 +133,11 @@ impl Resolver<'_> {
             }
             seen.push((name.key(), name.span));
             let Some((index, member)) = found else {
-                let d = Diagnostic::new("E0309", name.span, format!("`{}` is no member that can be initialised here", name.text));
+                let d = Diagnostic::new(
+                    "E0309",
+                    name.span,
+                    format!("`{}` is no member that can be initialised here", name.text),
+                );
                 self.diags.push(d);
                 continue;
             };

@@ -11,6 +11,7 @@ mod config;
 mod conversions;
 mod declare;
 mod expr;
+mod globals;
 mod init;
 mod operators;
 mod place;
@@ -19,6 +20,8 @@ mod recursion;
 mod resolve;
 mod stmt;
 pub mod tables;
+
+use std::collections::HashMap;
 
 use crate::artifact::sys;
 use crate::diagnostic::{Diagnostic, Span};
@@ -36,19 +39,19 @@ pub fn analyze(
     let mut diags = Vec::new();
     let image = match image_layout(options) {
         Ok(i) => i,
-        Err(d) => return (None, vec![d]),
+        Err(d) => return (None, vec![*d]),
     };
     let mut tables = Tables {
         image,
         addressing: options.addressing,
-        types: Default::default(),
+        types: HashMap::new(),
         structs: Vec::new(),
         enums: Vec::new(),
-        enum_values: Default::default(),
+        enum_values: HashMap::new(),
         globals: Vec::new(),
-        globals_by_name: Default::default(),
+        globals_by_name: HashMap::new(),
         pous: Vec::new(),
-        pous_by_name: Default::default(),
+        pous_by_name: HashMap::new(),
     };
     let decls = declare::declare(units, library, options, &mut tables, &mut diags);
     let mut bodies = Vec::with_capacity(decls.len());
@@ -69,18 +72,28 @@ pub fn analyze(
             bodies[slot] = Some(body);
         }
     }
+    // Whatever is not compiled is refused, even if no reason was found.
+    let dropped = bodies.iter().flatten().find_map(|b| b.dropped);
+    if let (Some(span), false) = (dropped, syntax_errors || diags.iter().any(|d| d.code.starts_with('E'))) {
+        diags.push(Diagnostic::new("E0901", span, "a statement was not compiled and no reason was given"));
+    }
     let call_depth = recursion::check(&tables, &bodies, &mut diags);
     let (tasks, instances) = config::configure(units, &tables, options, syntax_errors, &mut diags);
     (Some(Analyzed { tables, bodies, tasks, instances, call_depth }), diags)
 }
 
-fn image_layout(options: &Options) -> Result<ImageLayout, Diagnostic> {
-    for (name, bytes) in [("%I", options.input_bytes), ("%Q", options.output_bytes), ("%M", options.marker_bytes)] {
+fn image_layout(options: &Options) -> Result<ImageLayout, Box<Diagnostic>> {
+    for (name, bytes) in
+        [("%I", options.input_bytes), ("%Q", options.output_bytes), ("%M", options.marker_bytes)]
+    {
         if bytes > limits::IMAGE_BYTES {
-            return Err(Diagnostic::placeless(
+            return Err(Box::new(Diagnostic::placeless(
                 "E0804",
-                format!("{name} of {bytes} bytes: an area of the image has at most {} bytes", limits::IMAGE_BYTES),
-            ));
+                format!(
+                    "{name} of {bytes} bytes: an area of the image has at most {} bytes",
+                    limits::IMAGE_BYTES
+                ),
+            )));
         }
     }
     let up = |n: u32| n.next_multiple_of(8);

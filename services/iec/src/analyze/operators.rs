@@ -28,7 +28,14 @@ fn ir_op(op: Binary) -> BinOp {
 }
 
 impl Checker<'_> {
-    pub fn binary(&mut self, op: Binary, a: &ast::Expr, b: &ast::Expr, op_span: Span, want: Option<ElemType>) -> Val {
+    pub fn binary(
+        &mut self,
+        op: Binary,
+        a: &ast::Expr,
+        b: &ast::Expr,
+        op_span: Span,
+        want: Option<ElemType>,
+    ) -> Val {
         let hint = if op.is_comparison() { None } else { want };
         // The left spine of `a + b + c + ...` is walked in a loop: it may be thousands long.
         let mut spine: Vec<(Binary, &ast::Expr, Span)> = vec![(op, b, op_span)];
@@ -51,19 +58,30 @@ impl Checker<'_> {
 
     /// One operation on two values.
     #[allow(clippy::too_many_arguments)]
-    pub fn apply(&mut self, op: Binary, a: Val, a_span: Span, b: Val, b_span: Span, op_span: Span, want: Option<ElemType>) -> Val {
+    pub fn apply(
+        &mut self,
+        op: Binary,
+        a: Val,
+        a_span: Span,
+        b: Val,
+        b_span: Span,
+        op_span: Span,
+        want: Option<ElemType>,
+    ) -> Val {
         if matches!(a, Val::Error) || matches!(b, Val::Error) {
             return Val::Error;
         }
         for (v, span) in [(&a, a_span), (&b, b_span)] {
-            if matches!(v, Val::Whole(..) | Val::Void) {
+            if matches!(v, Val::Whole(..)) {
                 return self.bad_operand(op.text(), v, span);
             }
         }
         match (&a, &b) {
             (Val::Int(x), Val::Int(y)) => return self.int_literals(op, *x, *y, a_span.to(b_span), b_span),
             _ if op == Binary::Power => return self.power(a, a_span, b, b_span, want),
-            (Val::Int(_) | Val::Real(..), Val::Int(_) | Val::Real(..)) => return self.real_literals(op, &a, &b, a_span.to(b_span)),
+            (Val::Int(_) | Val::Real(..), Val::Int(_) | Val::Real(..)) => {
+                return self.real_literals(op, &a, &b, a_span.to(b_span));
+            }
             _ => {}
         }
         if let Some(v) = self.enums(op, &a, &b, op_span) {
@@ -73,7 +91,9 @@ impl Checker<'_> {
         if is_time(&a) || is_time(&b) {
             return self.time(op, a, a_span, b, b_span, op_span);
         }
-        let Some((x, y)) = self.unify(op.text(), a, a_span, b, b_span, op_span, want) else { return Val::Error };
+        let Some((x, y)) = self.unify(op.text(), a, a_span, b, b_span, op_span, want) else {
+            return Val::Error;
+        };
         self.operate(op, x, a_span, y, b_span)
     }
 
@@ -103,7 +123,8 @@ impl Checker<'_> {
             }
         }
         if matches!(op, Binary::AndThen | Binary::OrElse) {
-            let kind = ExprKind::ShortCircuit { and: op == Binary::AndThen, left: Box::new(x), right: Box::new(y) };
+            let kind =
+                ExprKind::ShortCircuit { and: op == Binary::AndThen, left: Box::new(x), right: Box::new(y) };
             return Val::elem(Expr::new(ElemType::Bool, kind));
         }
         let result = if op.is_comparison() { ElemType::Bool } else { ty };
@@ -131,19 +152,32 @@ impl Checker<'_> {
 
     /// Brings two operands to one type.
     #[allow(clippy::too_many_arguments)]
-    pub fn unify(&mut self, op: &str, a: Val, a_span: Span, b: Val, b_span: Span, op_span: Span, want: Option<ElemType>) -> Option<(Expr, Expr)> {
+    pub fn unify(
+        &mut self,
+        op: &str,
+        a: Val,
+        a_span: Span,
+        b: Val,
+        b_span: Span,
+        op_span: Span,
+        want: Option<ElemType>,
+    ) -> Option<(Expr, Expr)> {
         match (a, b) {
             (Val::Expr(x, tx), Val::Expr(y, ty)) => {
                 let Some(common) = common_type(x.ty, y.ty) else {
                     let (l, r) = (self.tables.type_name(&tx), self.tables.type_name(&ty));
-                    let d = Diagnostic::new("E0403", op_span, format!("`{op}` has no common type for {l} and {r}"))
-                        .also(a_span, l)
-                        .also(b_span, r)
-                        .help("convert one side with an X_TO_Y function");
+                    let d = Diagnostic::new(
+                        "E0403",
+                        op_span,
+                        format!("`{op}` has no common type for {l} and {r}"),
+                    )
+                    .also(a_span, l)
+                    .also(b_span, r)
+                    .help("convert one side with an X_TO_Y function");
                     self.report(d);
                     return None;
                 };
-                Some((self.widen(x, common)?, self.widen(y, common)?))
+                Some((Self::widen(x, common)?, Self::widen(y, common)?))
             }
             (lit, Val::Expr(y, _)) => {
                 let (l, y) = self.adapt(op, lit, a_span, y, op_span, want)?;
@@ -158,7 +192,15 @@ impl Checker<'_> {
     }
 
     /// A literal beside a value: the literal takes the value's type if it fits, else the value widens.
-    fn adapt(&mut self, op: &str, lit: Val, span: Span, e: Expr, op_span: Span, want: Option<ElemType>) -> Option<(Expr, Expr)> {
+    fn adapt(
+        &mut self,
+        op: &str,
+        lit: Val,
+        span: Span,
+        e: Expr,
+        op_span: Span,
+        want: Option<ElemType>,
+    ) -> Option<(Expr, Expr)> {
         let ty = e.ty;
         match lit {
             Val::Int(n) => {
@@ -166,7 +208,14 @@ impl Checker<'_> {
                     return Some((Expr::new(ty, ExprKind::Const(c)), e));
                 }
                 let chain: &[ElemType] = if ty.is_int() {
-                    &[ElemType::Int, ElemType::Uint, ElemType::Dint, ElemType::Udint, ElemType::Lint, ElemType::Ulint]
+                    &[
+                        ElemType::Int,
+                        ElemType::Uint,
+                        ElemType::Dint,
+                        ElemType::Udint,
+                        ElemType::Lint,
+                        ElemType::Ulint,
+                    ]
                 } else if ty.is_any_bit() {
                     &[ElemType::Byte, ElemType::Word, ElemType::Dword, ElemType::Lword]
                 } else {
@@ -176,11 +225,15 @@ impl Checker<'_> {
                     if widens(ty, *wide)
                         && let Some(c) = int_const(*wide, n)
                     {
-                        let e = self.widen(e, *wide)?;
+                        let e = Self::widen(e, *wide)?;
                         return Some((Expr::new(*wide, ExprKind::Const(c)), e));
                     }
                 }
-                let d = Diagnostic::new("E0404", span, format!("{n} does not fit {} or a type it widens to", ty.name()));
+                let d = Diagnostic::new(
+                    "E0404",
+                    span,
+                    format!("{n} does not fit {} or a type it widens to", ty.name()),
+                );
                 self.report(d);
                 None
             }
@@ -190,15 +243,19 @@ impl Checker<'_> {
                     t if widens(t, ElemType::Real) && want != Some(ElemType::Lreal) => ElemType::Real,
                     t if widens(t, ElemType::Lreal) => ElemType::Lreal,
                     _ => {
-                        let d = Diagnostic::new("E0403", op_span, format!("`{op}` has no common type for {} and a real number", ty.name()))
-                            .also(span, "this is real")
-                            .help("convert one side with an X_TO_Y function");
+                        let d = Diagnostic::new(
+                            "E0403",
+                            op_span,
+                            format!("`{op}` has no common type for {} and a real number", ty.name()),
+                        )
+                        .also(span, "this is real")
+                        .help("convert one side with an X_TO_Y function");
                         self.report(d);
                         return None;
                     }
                 };
                 let literal = self.coerce(Val::Real(d, f), span, &Type::Elem(to), "operand")?;
-                let e = self.widen(e, to)?;
+                let e = Self::widen(e, to)?;
                 Some((literal, e))
             }
             _ => None,
@@ -228,7 +285,13 @@ impl Checker<'_> {
             Binary::Ge => return Val::bool(x >= y),
             Binary::Power => match u32::try_from(y).ok().and_then(|n| x.checked_pow(n)) {
                 Some(v) => v,
-                None if y < 0 => return self.error("E0402", b_span, "an integer literal to a negative power; write the base as a real number, like 2.0"),
+                None if y < 0 => {
+                    return self.error(
+                        "E0402",
+                        b_span,
+                        "an integer literal to a negative power; write the base as a real number, like 2.0",
+                    );
+                }
                 None => return self.error("E0104", span, "the value does not fit the largest integer type"),
             },
         };
@@ -266,25 +329,33 @@ impl Checker<'_> {
     pub fn power(&mut self, a: Val, a_span: Span, b: Val, b_span: Span, want: Option<ElemType>) -> Val {
         let real_of = |v: &Val| match v {
             Val::Expr(e, _) if e.ty.is_real() => Some(e.ty),
-            Val::Expr(e, _) if e.ty.is_int() => Some(if widens(e.ty, ElemType::Real) { ElemType::Real } else { ElemType::Lreal }),
+            Val::Expr(e, _) if e.ty.is_int() => {
+                Some(if widens(e.ty, ElemType::Real) { ElemType::Real } else { ElemType::Lreal })
+            }
             _ => None,
         };
         let mut ty = real_of(&a).or(want.filter(|w| w.is_real())).unwrap_or(ElemType::Lreal);
         // An LREAL exponent makes the whole LREAL.
-        if matches!(&b, Val::Expr(e, _) if e.ty == ElemType::Lreal) || (matches!(&a, Val::Expr(e, _) if !e.ty.is_real()) && want == Some(ElemType::Lreal)) {
+        if matches!(&b, Val::Expr(e, _) if e.ty == ElemType::Lreal)
+            || (matches!(&a, Val::Expr(e, _) if !e.ty.is_real()) && want == Some(ElemType::Lreal))
+        {
             ty = ElemType::Lreal;
         }
-        let base = self.to_real(a, a_span, ty);
-        let exponent = self.to_real(b, b_span, ty);
+        let base = self.as_real(a, a_span, ty);
+        let exponent = self.as_real(b, b_span, ty);
         let (Some(x), Some(y)) = (base, exponent) else { return Val::Error };
         Val::elem(Expr::new(ty, ExprKind::Math(MathFn::Expt, vec![x, y])))
     }
 
     /// Any number as REAL or LREAL.
-    pub fn to_real(&mut self, v: Val, span: Span, ty: ElemType) -> Option<Expr> {
+    pub fn as_real(&mut self, v: Val, span: Span, ty: ElemType) -> Option<Expr> {
         match v {
-            Val::Expr(e, _) if e.ty.is_int() => Some(fold(Expr::new(ty, ExprKind::Convert(Convert::ToFloat, Box::new(e))))),
-            v @ (Val::Expr(..) | Val::Int(_) | Val::Real(..)) => self.coerce(v, span, &Type::Elem(ty), "operand"),
+            Val::Expr(e, _) if e.ty.is_int() => {
+                Some(fold(Expr::new(ty, ExprKind::Convert(Convert::ToFloat, Box::new(e)))))
+            }
+            v @ (Val::Expr(..) | Val::Int(_) | Val::Real(..)) => {
+                self.coerce(v, span, &Type::Elem(ty), "operand")
+            }
             Val::Error => None,
             other => {
                 self.bad_operand("**", &other, span);
@@ -299,13 +370,17 @@ impl Checker<'_> {
         match (is_time(&a), is_time(&b)) {
             (true, true) => {
                 if !matches!(op, Binary::Add | Binary::Sub) && !op.is_comparison() {
-                    let d = Diagnostic::new("E0402", op_span, format!("`{}` cannot join TIME and TIME", op.text()))
-                        .help("convert, for example TIME_TO_LINT(a) / TIME_TO_LINT(b)");
+                    let d = Diagnostic::new(
+                        "E0402",
+                        op_span,
+                        format!("`{}` cannot join TIME and TIME", op.text()),
+                    )
+                    .help("convert, for example TIME_TO_LINT(a) / TIME_TO_LINT(b)");
                     self.report(d);
                     return Val::Error;
                 }
                 let (Val::Expr(x, _), Val::Expr(y, _)) = (a, b) else { return Val::Error };
-                self.operate_time(op, x, y)
+                Self::operate_time(op, x, y)
             }
             (true, false) if matches!(op, Binary::Mul | Binary::Div) => {
                 let Val::Expr(t, _) = a else { return Val::Error };
@@ -325,7 +400,7 @@ impl Checker<'_> {
         }
     }
 
-    fn operate_time(&mut self, op: Binary, x: Expr, y: Expr) -> Val {
+    fn operate_time(op: Binary, x: Expr, y: Expr) -> Val {
         let result = if op.is_comparison() { ElemType::Bool } else { ElemType::Time };
         Val::elem(fold(Expr::new(result, ExprKind::Binary(ir_op(op), Box::new(x), Box::new(y)))))
     }
@@ -338,21 +413,31 @@ impl Checker<'_> {
             _ => false,
         };
         if real {
-            let Some(by) = self.coerce(by, span, &Type::Elem(ElemType::Lreal), "factor") else { return Val::Error };
+            let Some(by) = self.coerce(by, span, &Type::Elem(ElemType::Lreal), "factor") else {
+                return Val::Error;
+            };
             let t = fold(Expr::new(ElemType::Lreal, ExprKind::Convert(Convert::ToFloat, Box::new(time))));
-            let product = fold(Expr::new(ElemType::Lreal, ExprKind::Binary(ir_op(op), Box::new(t), Box::new(by))));
-            return Val::elem(fold(Expr::new(ElemType::Time, ExprKind::Convert(Convert::Round, Box::new(product)))));
+            let product =
+                fold(Expr::new(ElemType::Lreal, ExprKind::Binary(ir_op(op), Box::new(t), Box::new(by))));
+            return Val::elem(fold(Expr::new(
+                ElemType::Time,
+                ExprKind::Convert(Convert::Round, Box::new(product)),
+            )));
         }
         let factor = match by {
-            Val::Int(0) if op == Binary::Div => return self.error("E0405", span, "division by the constant 0"),
+            Val::Int(0) if op == Binary::Div => {
+                return self.error("E0405", span, "division by the constant 0");
+            }
             Val::Int(n) => match i64::try_from(n) {
                 Ok(n) => Expr::int(ElemType::Time, n),
                 Err(_) => return self.error("E0404", span, format!("{n} does not fit LINT")),
             },
-            Val::Expr(e, _) if e.ty.is_int() => fold(Expr::new(ElemType::Time, ExprKind::Convert(Convert::Wrap, Box::new(e)))),
+            Val::Expr(e, _) if e.ty.is_int() => {
+                fold(Expr::new(ElemType::Time, ExprKind::Convert(Convert::Wrap, Box::new(e))))
+            }
             other => return self.bad_operand(op.text(), &other, span),
         };
-        self.operate_time(op, time, factor)
+        Self::operate_time(op, time, factor)
     }
 
     /// A literal that nothing gives a type to: DINT if it fits, then LINT, ULINT; LREAL.
@@ -366,12 +451,14 @@ impl Checker<'_> {
                     .find_map(fits)
             }
             Val::Real(d, f) => Some(match want {
-                Some(ElemType::Real) if f.is_finite() => Expr::new(ElemType::Real, ExprKind::Const(Const::F32(*f))),
+                Some(ElemType::Real) if f.is_finite() => {
+                    Expr::new(ElemType::Real, ExprKind::Const(Const::F32(*f)))
+                }
                 _ => Expr::new(ElemType::Lreal, ExprKind::Const(Const::F64(*d))),
             }),
             Val::Expr(e, _) => Some(e.clone()),
             Val::Error => None,
-            other => {
+            other @ Val::Whole(..) => {
                 let what = self.describe(other);
                 self.report(Diagnostic::new("E0401", span, format!("a value is needed here, not {what}")));
                 None

@@ -61,8 +61,12 @@ impl Checker<'_> {
         match self.tables.enum_values.get(&key) {
             Some(Some((e, v))) => return Target::Const(Const::I(*v), Type::Enum(*e)),
             Some(None) => {
-                let d = Diagnostic::new("E0312", name.span, format!("several enumerations have a value `{}`", name.text))
-                    .help(format!("write Type#{}", name.text));
+                let d = Diagnostic::new(
+                    "E0312",
+                    name.span,
+                    format!("several enumerations have a value `{}`", name.text),
+                )
+                .help(format!("write Type#{}", name.text));
                 self.report(d);
                 return Target::Error;
             }
@@ -79,13 +83,21 @@ impl Checker<'_> {
         let near = nearest(&key, own.chain(globals));
         let mut d = Diagnostic::new("E0302", name.span, format!("there is no variable `{}`", name.text));
         if self.constant_only && self.pou.is_some() {
-            d = Diagnostic::new("E0302", name.span, format!("`{}` is no constant that is known here", name.text))
-                .help("constants stand in VAR CONSTANT or VAR_GLOBAL CONSTANT before their use");
+            d = Diagnostic::new(
+                "E0302",
+                name.span,
+                format!("`{}` is no constant that is known here", name.text),
+            )
+            .help("constants stand in VAR CONSTANT or VAR_GLOBAL CONSTANT before their use");
         } else if let Some(n) = near {
             d = d.help(format!("did you mean `{n}`?"));
         } else if let Some(&p) = self.tables.pous_by_name.get(&key) {
             let p = &self.tables.pous[p as usize];
-            d = Diagnostic::new("E0302", name.span, format!("`{}` is a {}, not a variable", name.text, p.kind.keyword()));
+            d = Diagnostic::new(
+                "E0302",
+                name.span,
+                format!("`{}` is a {}, not a variable", name.text, p.kind.keyword()),
+            );
             if p.kind == PouKind::FunctionBlock {
                 d = d.help(format!("declare an instance: VAR x : {}; END_VAR", p.name.text));
             }
@@ -99,11 +111,18 @@ impl Checker<'_> {
         let v = &pou.vars[i as usize];
         if let Some(g) = v.external {
             return match self.global(g) {
-                Target::Place(p, t, _) if v.constant => Target::Place(p, t, Access::ReadOnly("it is a CONSTANT")),
+                Target::Place(p, t, _) if v.constant => {
+                    Target::Place(p, t, Access::ReadOnly("it is a CONSTANT"))
+                }
                 other => other,
             };
         }
-        if v.section == Section::External || v.ty == Type::Error {
+        if v.section == Section::External {
+            // Not linked yet: a constant expression of a declaration. A missing global is reported when it is linked.
+            let global = self.tables.globals_by_name.get(&v.name.key()).copied();
+            return global.map_or(Target::Error, |g| self.global(g));
+        }
+        if v.ty == Type::Error {
             return Target::Error;
         }
         if let (true, Some(c)) = (v.constant, v.value) {
@@ -203,9 +222,13 @@ impl Checker<'_> {
             Section::Input => Access::Full,
             Section::Output => Access::ReadOnly("it is an output of the function block"),
             _ => {
-                let d = Diagnostic::new("E0309", field.span, format!("`{}` of {} is not visible from outside", v.name.text, p.name.text))
-                    .also(v.name.span, format!("it stands in {}", v.section.keyword()))
-                    .help("only VAR_INPUT and VAR_OUTPUT can be reached from outside");
+                let d = Diagnostic::new(
+                    "E0309",
+                    field.span,
+                    format!("`{}` of {} is not visible from outside", v.name.text, p.name.text),
+                )
+                .also(v.name.span, format!("it stands in {}", v.section.keyword()))
+                .help("only VAR_INPUT and VAR_OUTPUT can be reached from outside");
                 self.report(d);
                 return Target::Error;
             }
@@ -242,7 +265,11 @@ impl Checker<'_> {
         loop {
             let n = array.dims.len();
             if rest.len() < n {
-                let d = Diagnostic::new("E0409", span, format!("{} subscripts for an array of {n} dimensions", subscripts.len()));
+                let d = Diagnostic::new(
+                    "E0409",
+                    span,
+                    format!("{} subscripts for an array of {n} dimensions", subscripts.len()),
+                );
                 self.report(d);
                 return Target::Error;
             }
@@ -255,7 +282,11 @@ impl Checker<'_> {
                 return Target::Place(place, array.of.clone(), access);
             }
             let Type::Array(next) = array.of.clone() else {
-                let d = Diagnostic::new("E0409", span, format!("{} subscripts for an array of {n} dimensions", subscripts.len()));
+                let d = Diagnostic::new(
+                    "E0409",
+                    span,
+                    format!("{} subscripts for an array of {n} dimensions", subscripts.len()),
+                );
                 self.report(d);
                 return Target::Error;
             };
@@ -285,21 +316,24 @@ impl Checker<'_> {
                 }
                 other => {
                     let what = self.describe(&other);
-                    let d = Diagnostic::new("E0401", s.span, format!("a subscript is an integer, not {what}"));
+                    let d =
+                        Diagnostic::new("E0401", s.span, format!("a subscript is an integer, not {what}"));
                     self.report(d);
                     good = false;
                     continue;
                 }
             };
             if let Some(c) = value.as_int() {
-                good &= self.constant_subscript(place, s.span, crate::ir::value(value.ty, c), (*lo, *hi), stride);
+                good &=
+                    self.constant_subscript(place, s.span, crate::ir::value(value.ty, c), (*lo, *hi), stride);
                 continue;
             }
             let range = self.range(&value);
             let inside = range.0 >= i128::from(*lo) && range.1 <= i128::from(*hi);
             // In debug builds a variable may be changed at a breakpoint, so nothing is known for sure.
             let check = !inside || self.options.debug;
-            let (value, lo, hi) = if check { (value, *lo, *hi) } else { self.shift_constant(value, *lo, *hi) };
+            let (value, lo, hi) =
+                if check { (value, *lo, *hi) } else { self.shift_constant(value, *lo, *hi) };
             let nonneg = self.range(&value).0 >= 0;
             let term = IndexTerm { value, lo, hi, stride, check, nonneg };
             place.index.get_or_insert_with(|| Box::new(Index { terms: Vec::new() })).terms.push(term);
@@ -323,9 +357,20 @@ impl Checker<'_> {
         (value, lo, hi)
     }
 
-    fn constant_subscript(&mut self, place: &mut Place, span: Span, v: i128, (lo, hi): (i64, i64), stride: u32) -> bool {
+    fn constant_subscript(
+        &mut self,
+        place: &mut Place,
+        span: Span,
+        v: i128,
+        (lo, hi): (i64, i64),
+        stride: u32,
+    ) -> bool {
         if v < i128::from(lo) || v > i128::from(hi) {
-            let d = Diagnostic::new("E0406", span, format!("index {v} is outside of the array's bounds {lo}..{hi}"));
+            let d = Diagnostic::new(
+                "E0406",
+                span,
+                format!("index {v} is outside of the array's bounds {lo}..{hi}"),
+            );
             self.report(d);
             return false;
         }

@@ -26,7 +26,9 @@ impl Checker<'_> {
                     BinOp::Add => kept((x.0 + y.0, x.1 + y.1)),
                     BinOp::Sub => kept((x.0 - y.1, x.1 - y.0)),
                     BinOp::Mul => {
-                        if x.0.unsigned_abs().max(x.1.unsigned_abs()) > 1 << 62 || y.0.unsigned_abs().max(y.1.unsigned_abs()) > 1 << 62 {
+                        if x.0.unsigned_abs().max(x.1.unsigned_abs()) > 1 << 62
+                            || y.0.unsigned_abs().max(y.1.unsigned_abs()) > 1 << 62
+                        {
                             return all;
                         }
                         let p = [x.0 * y.0, x.0 * y.1, x.1 * y.0, x.1 * y.1];
@@ -44,7 +46,11 @@ impl Checker<'_> {
                 }
             }
             ExprKind::Convert(Convert::Wrap, a) if a.ty != ElemType::Time => {
-                if a.ty.is_real() { all } else { kept(self.range(a)) }
+                if a.ty.is_real() {
+                    all
+                } else {
+                    kept(self.range(a))
+                }
             }
             ExprKind::InRange { lo, hi, .. } => (i128::from(*lo), i128::from(*hi)),
             ExprKind::Select(_, a, b) if !e.ty.is_real() => {

@@ -29,9 +29,11 @@ impl Resolver<'_> {
             TypeSpecKind::Subrange { base, lo, hi } => (self.subrange(base, lo, hi, pou), InitData::Default),
             TypeSpecKind::Array { dims, of } => (self.array(spec.span, dims, of, pou), InitData::Default),
             TypeSpecKind::Struct(_) | TypeSpecKind::Enum(_) => {
-                let what = if matches!(spec.kind, TypeSpecKind::Struct(_)) { "STRUCT" } else { "enumeration" };
-                let d = Diagnostic::new("E0905", spec.span, format!("an unnamed {what} is not supported here"))
-                    .help("declare it as TYPE name : ... END_TYPE and use the name");
+                let what =
+                    if matches!(spec.kind, TypeSpecKind::Struct(_)) { "STRUCT" } else { "enumeration" };
+                let d =
+                    Diagnostic::new("E0905", spec.span, format!("an unnamed {what} is not supported here"))
+                        .help("declare it as TYPE name : ... END_TYPE and use the name");
                 self.diags.push(d);
                 (Type::Error, InitData::Default)
             }
@@ -51,23 +53,54 @@ impl Resolver<'_> {
             if p.kind == crate::syntax::ast::PouKind::FunctionBlock {
                 return (Type::Fb(pou), InitData::Default);
             }
-            let d = Diagnostic::new("E0303", name.span, format!("`{}` is a {} and no type", name.text, p.kind.keyword()))
-                .also(p.name.span, "declared here");
+            let d = Diagnostic::new(
+                "E0303",
+                name.span,
+                format!("`{}` is a {} and no type", name.text, p.kind.keyword()),
+            )
+            .also(p.name.span, "declared here");
             self.diags.push(d);
             return (Type::Error, InitData::Default);
         }
         let unsupported = [
-            "STRING", "WSTRING", "CHAR", "WCHAR", "DATE", "LDATE", "TIME_OF_DAY", "TOD", "LTOD", "DATE_AND_TIME", "DT",
-            "LDT", "POINTER", "REFERENCE",
+            "STRING",
+            "WSTRING",
+            "CHAR",
+            "WCHAR",
+            "DATE",
+            "LDATE",
+            "TIME_OF_DAY",
+            "TOD",
+            "LTOD",
+            "DATE_AND_TIME",
+            "DT",
+            "LDT",
+            "POINTER",
+            "REFERENCE",
         ];
         let d = if unsupported.contains(&key.as_str()) {
             Diagnostic::new("E0906", name.span, format!("type {key} is not supported yet"))
         } else {
             Diagnostic::new("E0303", name.span, format!("there is no type `{}`", name.text)).help(
-                nearest(&key, self.tables.types.keys().map(String::as_str).chain(
-                    self.tables.pous.iter().filter(|p| p.kind == crate::syntax::ast::PouKind::FunctionBlock).map(|p| p.name.text.as_str()),
-                ).chain(ELEMENTARY.iter().copied()))
-                .map_or_else(|| "declare it with TYPE or FUNCTION_BLOCK".to_owned(), |n| format!("did you mean `{n}`?")),
+                nearest(
+                    &key,
+                    self.tables
+                        .types
+                        .keys()
+                        .map(String::as_str)
+                        .chain(
+                            self.tables
+                                .pous
+                                .iter()
+                                .filter(|p| p.kind == crate::syntax::ast::PouKind::FunctionBlock)
+                                .map(|p| p.name.text.as_str()),
+                        )
+                        .chain(ELEMENTARY.iter().copied()),
+                )
+                .map_or_else(
+                    || "declare it with TYPE or FUNCTION_BLOCK".to_owned(),
+                    |n| format!("did you mean `{n}`?"),
+                ),
             )
         };
         self.diags.push(d);
@@ -97,7 +130,11 @@ impl Resolver<'_> {
         let (Some(l), Some(h)) = (self.constant(lo, pou), self.constant(hi, pou)) else { return Type::Error };
         let Type::Elem(e) = ty else {
             if ty != Type::Error {
-                self.diags.push(Diagnostic::new("E0401", base.span, "a subrange is made from an integer type"));
+                self.diags.push(Diagnostic::new(
+                    "E0401",
+                    base.span,
+                    "a subrange is made from an integer type",
+                ));
             }
             return Type::Error;
         };
@@ -121,11 +158,17 @@ impl Resolver<'_> {
         let mut bounds = Vec::new();
         let mut elements: i128 = 1;
         for (lo, hi) in dims {
-            let (Some(l), Some(h)) = (self.constant(lo, pou), self.constant(hi, pou)) else { return Type::Error };
+            let (Some(l), Some(h)) = (self.constant(lo, pou), self.constant(hi, pou)) else {
+                return Type::Error;
+            };
             let fits = |v: i128| i32::try_from(v).is_ok();
             if l > h || !fits(l) || !fits(h) {
-                let d = Diagnostic::new("E0407", lo.span.to(hi.span), format!("array bounds {l}..{h} are no range"))
-                    .help("the lower bound comes first; bounds are DINT values");
+                let d = Diagnostic::new(
+                    "E0407",
+                    lo.span.to(hi.span),
+                    format!("array bounds {l}..{h} are no range"),
+                )
+                .help("the lower bound comes first; bounds are DINT values");
                 self.diags.push(d);
                 return Type::Error;
             }
@@ -136,18 +179,26 @@ impl Resolver<'_> {
             return Type::Error;
         }
         if of_init != InitData::Default {
-            let d = Diagnostic::new("E0905", of.span, "array elements of a type with its own initial value are not supported yet")
-                .help("initialise the array instead");
+            let d = Diagnostic::new(
+                "E0905",
+                of.span,
+                "array elements of a type with its own initial value are not supported yet",
+            )
+            .help("initialise the array instead");
             self.diags.push(d);
         }
         let bytes = elements * i128::from(self.tables.size_of(&of_ty).max(1));
         if elements > limits::ARRAY_ELEMENTS || bytes > i128::from(limits::MEMORY_BYTES) {
-            let d = Diagnostic::new("E0805", span, format!("array has {elements} elements of {} bytes", self.tables.size_of(&of_ty)))
-                .help(format!(
-                    "at most {} elements and {} bytes of memory altogether",
-                    limits::ARRAY_ELEMENTS,
-                    limits::MEMORY_BYTES
-                ));
+            let d = Diagnostic::new(
+                "E0805",
+                span,
+                format!("array has {elements} elements of {} bytes", self.tables.size_of(&of_ty)),
+            )
+            .help(format!(
+                "at most {} elements and {} bytes of memory altogether",
+                limits::ARRAY_ELEMENTS,
+                limits::MEMORY_BYTES
+            ));
             self.diags.push(d);
             return Type::Error;
         }
@@ -175,14 +226,23 @@ impl Resolver<'_> {
                 }
                 let a = self.tables.align_of(&ty);
                 bytes = bytes.next_multiple_of(u64::from(a));
-                out.push(Field { name: name.clone(), ty: ty.clone(), init: init.clone(), offset: bytes.min(u64::from(u32::MAX)) as u32 });
+                out.push(Field {
+                    name: name.clone(),
+                    ty: ty.clone(),
+                    init: init.clone(),
+                    offset: bytes.min(u64::from(u32::MAX)) as u32,
+                });
                 bytes += self.tables.size_of(&ty);
                 align = align.max(a);
             }
         }
         bytes = bytes.next_multiple_of(u64::from(align));
         if bytes > limits::MEMORY_BYTES {
-            self.diags.push(Diagnostic::new("E0805", name.span, format!("STRUCT `{}` has {bytes} bytes", name.text)));
+            self.diags.push(Diagnostic::new(
+                "E0805",
+                name.span,
+                format!("STRUCT `{}` has {bytes} bytes", name.text),
+            ));
             return Type::Error;
         }
         let index = self.tables.structs.len() as u32;
@@ -200,7 +260,11 @@ impl Resolver<'_> {
                 next = self.constant(v, None).unwrap_or(next);
             }
             if i16::try_from(next).is_err() {
-                let d = Diagnostic::new("E0104", ident.span, format!("value {next} does not fit: enumerations are INT"));
+                let d = Diagnostic::new(
+                    "E0104",
+                    ident.span,
+                    format!("value {next} does not fit: enumerations are INT"),
+                );
                 self.diags.push(d);
                 next = 0;
             }
@@ -235,8 +299,8 @@ impl Resolver<'_> {
 }
 
 const ELEMENTARY: &[&str] = &[
-    "BOOL", "BYTE", "WORD", "DWORD", "LWORD", "SINT", "INT", "DINT", "LINT", "USINT", "UINT", "UDINT", "ULINT", "REAL",
-    "LREAL", "TIME", "LTIME",
+    "BOOL", "BYTE", "WORD", "DWORD", "LWORD", "SINT", "INT", "DINT", "LINT", "USINT", "UINT", "UDINT",
+    "ULINT", "REAL", "LREAL", "TIME", "LTIME",
 ];
 
 /// Where an address lies in linear memory; `Err` is a sentence and its code.
@@ -259,7 +323,9 @@ pub fn locate(tables: &Tables, text: &str, ty: &Type) -> Result<Located, (&'stat
     };
     let fits = match storage {
         Storage::Bit(_) | Storage::Millis32 => true,
-        Storage::Plain => elem != ElemType::Bool && address.bit.is_none() && address.size.bytes() == elem.bytes(),
+        Storage::Plain => {
+            elem != ElemType::Bool && address.bit.is_none() && address.size.bytes() == elem.bytes()
+        }
     };
     if !fits {
         return Err(("E0603", size_mismatch(&address, elem)));
@@ -287,17 +353,22 @@ fn size_mismatch(address: &LocatedAddress, elem: ElemType) -> String {
         _ => 'L',
     };
     let also = if elem == ElemType::Time { " or D (32-bit milliseconds)" } else { "" };
-    format!("{} does not fit an address of size {}; it needs size {wants}{also}", elem.name(), address.size.letter())
+    format!(
+        "{} does not fit an address of size {}; it needs size {wants}{also}",
+        elem.name(),
+        address.size.letter()
+    )
 }
 
 /// The name that is most like `key`, if one is near.
 pub fn nearest<'n>(key: &str, names: impl Iterator<Item = &'n str>) -> Option<String> {
     let key = key.to_ascii_uppercase();
-    let limit = (key.len() / 3).clamp(1, 3);
+    // Short names are all alike.
+    let limit = if key.len() < 3 { 0 } else { key.len().div_ceil(3).min(3) };
     names
         .into_iter()
         .map(|n| (distance(&key, &n.to_ascii_uppercase()), n))
-        .filter(|(d, _)| *d <= limit)
+        .filter(|(d, _)| *d <= limit && limit > 0)
         .min()
         .map(|(_, n)| n.to_owned())
 }

@@ -11,11 +11,18 @@ use crate::syntax::ast;
 use crate::types::{ElemExt, Type};
 
 /// Checks the body of a POU.
-pub fn check_body(tables: &Tables, pou: u32, decl: &ast::Pou, options: &Options, diags: &mut Vec<Diagnostic>) -> Body {
+pub fn check_body(
+    tables: &Tables,
+    pou: u32,
+    decl: &ast::Pou,
+    options: &Options,
+    diags: &mut Vec<Diagnostic>,
+) -> Body {
     let mut ck = Checker::new(tables, tables.pous.get(pou as usize), options);
     let stmts = ck.statements(&decl.body);
     ck.body.stmts = stmts;
     ck.missing_result(decl);
+    ck.body.dropped = ck.dropped.then_some(decl.name.span);
     diags.append(&mut ck.diags);
     ck.body
 }
@@ -25,8 +32,12 @@ impl Checker<'_> {
     fn missing_result(&mut self, decl: &ast::Pou) {
         let returns = self.pou.is_some_and(|p| p.returns.is_some());
         if decl.kind == ast::PouKind::Function && returns && !changes(&decl.body, &decl.name.text) {
-            let d = Diagnostic::new("W0206", decl.name.span, format!("function {} never assigns its result", decl.name.text))
-                .help(format!("add `{} := ...;`", decl.name.text));
+            let d = Diagnostic::new(
+                "W0206",
+                decl.name.span,
+                format!("function {} never assigns its result", decl.name.text),
+            )
+            .help(format!("add `{} := ...;`", decl.name.text));
             self.report(d);
         }
     }
@@ -40,6 +51,7 @@ impl Checker<'_> {
         self.statement = s.id;
         let kind = self.kind(s);
         self.statement = outer;
+        self.dropped |= kind.is_none() && !matches!(s.kind, ast::StmtKind::Empty);
         kind.map(|kind| Stmt { id: s.id, kind })
     }
 
@@ -111,19 +123,29 @@ impl Checker<'_> {
                 Some(StmtKind::Copy { to: place, from, bytes })
             }
             Val::Whole(..) if matches!(ty, Type::Fb(_)) => {
-                let d = Diagnostic::new("E0905", target.span, "instances of function blocks cannot be assigned");
+                let d =
+                    Diagnostic::new("E0905", target.span, "instances of function blocks cannot be assigned");
                 self.report(d);
                 None
             }
             other => {
                 let (want, found) = (self.tables.type_name(&ty), self.describe(&other));
-                self.report(Diagnostic::new("E0401", value.span, format!("assignment: {want} is needed, found {found}")));
+                self.report(Diagnostic::new(
+                    "E0401",
+                    value.span,
+                    format!("assignment: {want} is needed, found {found}"),
+                ));
                 None
             }
         }
     }
 
-    fn case(&mut self, selector: &ast::Expr, arms: &[ast::CaseArm], otherwise: &[ast::Stmt]) -> Option<StmtKind> {
+    fn case(
+        &mut self,
+        selector: &ast::Expr,
+        arms: &[ast::CaseArm],
+        otherwise: &[ast::Stmt],
+    ) -> Option<StmtKind> {
         let v = self.expr(selector, None);
         let (e, ty) = match v {
             Val::Expr(e, ty) if e.ty.is_int() || e.ty.is_any_bit() => (Some(e), ty),
@@ -135,7 +157,11 @@ impl Checker<'_> {
             Val::Error => (None, Type::Error),
             other => {
                 let found = self.describe(&other);
-                let d = Diagnostic::new("E0401", selector.span, format!("CASE needs an integer, a bit string or an enumeration, found {found}"));
+                let d = Diagnostic::new(
+                    "E0401",
+                    selector.span,
+                    format!("CASE needs an integer, a bit string or an enumeration, found {found}"),
+                );
                 self.report(d);
                 (None, Type::Error)
             }
@@ -169,7 +195,8 @@ impl Checker<'_> {
 
     fn note_label(&mut self, seen: &mut Vec<(i128, i128, Span)>, lo: i128, hi: i128, span: Span) {
         if lo > hi {
-            let d = Diagnostic::new("E0407", span, format!("{lo}..{hi} is no range")).help("the lower value comes first");
+            let d = Diagnostic::new("E0407", span, format!("{lo}..{hi} is no range"))
+                .help("the lower value comes first");
             self.report(d);
             return;
         }
@@ -184,7 +211,9 @@ impl Checker<'_> {
                 && lo <= end
             {
                 let (first, second) = if first.start < span.start { (first, span) } else { (span, first) };
-                let d = Diagnostic::new("W0204", second, "this CASE label is covered already").also(first, "by this one").help("the first match runs");
+                let d = Diagnostic::new("W0204", second, "this CASE label is covered already")
+                    .also(first, "by this one")
+                    .help("the first match runs");
                 self.report(d);
             }
             if reach.is_none_or(|(end, _)| hi > end) {
@@ -219,11 +248,17 @@ impl Checker<'_> {
     ) -> Option<StmtKind> {
         let target = self.assignable(var);
         let (place, ty) = match target {
-            Some((p, t)) if t.elem().is_some_and(|e| e.is_int()) && !matches!(t, Type::Enum(_)) => (Some(p), t),
+            Some((p, t)) if t.elem().is_some_and(|e| e.is_int()) && !matches!(t, Type::Enum(_)) => {
+                (Some(p), t)
+            }
             Some((_, t)) => {
                 let found = self.tables.type_name(&t);
                 if t != Type::Error {
-                    self.report(Diagnostic::new("E0401", var.span, format!("FOR needs an integer variable, found {found}")));
+                    self.report(Diagnostic::new(
+                        "E0401",
+                        var.span,
+                        format!("FOR needs an integer variable, found {found}"),
+                    ));
                 }
                 (None, Type::Error)
             }
@@ -232,22 +267,30 @@ impl Checker<'_> {
         let elem = ty.elem().unwrap_or(ElemType::Dint);
         let from_v = self.expr(from, Some(elem));
         let to_v = self.expr(to, Some(elem));
-        let (from_e, to_e) = (self.coerce(from_v, from.span, &ty, "start of FOR"), self.coerce(to_v, to.span, &ty, "end of FOR"));
+        let (from_e, to_e) = (
+            self.coerce(from_v, from.span, &ty, "start of FOR"),
+            self.coerce(to_v, to.span, &ty, "end of FOR"),
+        );
         let step = self.step(by, elem);
         let changed = match &var.kind {
             ast::ExprKind::Name(name) => changes(body, &name.text),
             _ => true,
         };
         if let (true, ast::ExprKind::Name(name)) = (changed, &var.kind) {
-            let d = Diagnostic::new("W0201", var.span, format!("the loop may change its control variable `{}`", name.text))
-                .help("the standard forbids it; the changed value counts here. Use WHILE if that is meant");
+            let d = Diagnostic::new(
+                "W0201",
+                var.span,
+                format!("the loop may change its control variable `{}`", name.text),
+            )
+            .help("the standard forbids it; the changed value counts here. Use WHILE if that is meant");
             self.report(d);
         }
         let (Some(place), Some(from), Some(to), Some(step)) = (place, from_e, to_e, step) else {
             self.looped(body);
             return None;
         };
-        let private = matches!(place.base, Base::Var(_)) && place.index.is_none() && place.storage == Storage::Plain;
+        let private =
+            matches!(place.base, Base::Var(_)) && place.index.is_none() && place.storage == Storage::Plain;
         let counter = (!changed && private && !self.options.debug).then(|| {
             let (f, t) = (self.range(&from), self.range(&to));
             let range = match step {
@@ -281,7 +324,11 @@ impl Checker<'_> {
                 match i64::try_from(n) {
                     Ok(v) if n.abs() <= width => Some(Step::Const(v)),
                     _ => {
-                        self.report(Diagnostic::new("E0404", by.span, format!("a step of {n} is wider than {}", elem.name())));
+                        self.report(Diagnostic::new(
+                            "E0404",
+                            by.span,
+                            format!("a step of {n} is wider than {}", elem.name()),
+                        ));
                         None
                     }
                 }
@@ -300,7 +347,11 @@ impl Checker<'_> {
             Val::Error => None,
             other => {
                 let found = self.describe(&other);
-                self.report(Diagnostic::new("E0401", by.span, format!("step of FOR: an integer is needed, found {found}")));
+                self.report(Diagnostic::new(
+                    "E0401",
+                    by.span,
+                    format!("step of FOR: an integer is needed, found {found}"),
+                ));
                 None
             }
         }

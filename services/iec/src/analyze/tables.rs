@@ -138,7 +138,9 @@ impl Tables {
     /// Bytes of a variable of this type.
     pub fn size_of(&self, ty: &Type) -> u64 {
         match ty {
-            Type::Elem(_) | Type::Subrange(_) | Type::Enum(_) => ty.elem().map_or(0, |e| u64::from(e.bytes())),
+            Type::Elem(_) | Type::Subrange(_) | Type::Enum(_) => {
+                ty.elem().map_or(0, |e| u64::from(e.bytes()))
+            }
             Type::Array(a) => u64::from(a.elements()) * self.size_of(&a.of),
             Type::Struct(i) => self.structs.get(*i as usize).map_or(0, |s| u64::from(s.bytes)),
             Type::Fb(i) => self.pous.get(*i as usize).map_or(0, |p| u64::from(p.bytes)),

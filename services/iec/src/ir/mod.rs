@@ -38,14 +38,22 @@ pub enum ExprKind {
     /// Only the chosen item counts; all are evaluated. Out of range is a fault.
     Mux(Box<Expr>, Vec<Expr>),
     /// AND_THEN, OR_ELSE: the right side only if needed.
-    ShortCircuit { and: bool, left: Box<Expr>, right: Box<Expr> },
+    ShortCircuit {
+        and: bool,
+        left: Box<Expr>,
+        right: Box<Expr>,
+    },
     Call(Box<Call>),
     /// An imported function of the host's pinned mathematics library.
     Math(MathFn, Vec<Expr>),
     /// The scan's stamp.
     Now,
     /// A subrange check: fault if the value is outside.
-    InRange { value: Box<Expr>, lo: i64, hi: i64 },
+    InRange {
+        value: Box<Expr>,
+        lo: i64,
+        hi: i64,
+    },
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -228,20 +236,49 @@ pub struct Stmt {
 
 #[derive(Debug, Clone, PartialEq)]
 pub enum StmtKind {
-    Store { place: Place, value: Expr },
-    SetTemp { temp: u32, value: Expr },
+    Store {
+        place: Place,
+        value: Expr,
+    },
+    SetTemp {
+        temp: u32,
+        value: Expr,
+    },
     /// Whole arrays and structures.
-    Copy { to: Place, from: Place, bytes: u32 },
+    Copy {
+        to: Place,
+        from: Place,
+        bytes: u32,
+    },
     /// Value not used.
     Eval(Expr),
     /// Function without result.
     CallVoid(Call),
-    CallFb { pou: u32, instance: Place, inputs: Vec<FbInput>, outputs: Vec<OutputCopy> },
-    If { branches: Vec<(u32, Expr, Vec<Stmt>)>, otherwise: Vec<Stmt> },
-    Case { selector: Expr, arms: Vec<(Vec<(i64, i64)>, Vec<Stmt>)>, otherwise: Vec<Stmt> },
+    CallFb {
+        pou: u32,
+        instance: Place,
+        inputs: Vec<FbInput>,
+        outputs: Vec<OutputCopy>,
+    },
+    If {
+        branches: Vec<(u32, Expr, Vec<Stmt>)>,
+        otherwise: Vec<Stmt>,
+    },
+    Case {
+        selector: Expr,
+        arms: Vec<CaseArm>,
+        otherwise: Vec<Stmt>,
+    },
     For(Box<For>),
-    While { cond: Expr, body: Vec<Stmt> },
-    Repeat { body: Vec<Stmt>, until: Expr, until_id: u32 },
+    While {
+        cond: Expr,
+        body: Vec<Stmt>,
+    },
+    Repeat {
+        body: Vec<Stmt>,
+        until: Expr,
+        until_id: u32,
+    },
     Exit,
     Continue,
     Return,
@@ -249,12 +286,25 @@ pub enum StmtKind {
     Nop,
 }
 
+/// Labels of a CASE arm, and its statements.
+pub type CaseArm = (Vec<(i64, i64)>, Vec<Stmt>);
+
 #[derive(Debug, Clone, PartialEq)]
 pub enum FbInput {
-    Value { offset: u32, value: Expr },
-    Copy { offset: u32, from: Place, bytes: u32 },
+    Value {
+        offset: u32,
+        value: Expr,
+    },
+    Copy {
+        offset: u32,
+        from: Place,
+        bytes: u32,
+    },
     /// VAR_IN_OUT: the address goes into the hidden slot at `offset`.
-    Address { offset: u32, of: Place },
+    Address {
+        offset: u32,
+        of: Place,
+    },
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -288,6 +338,8 @@ pub struct Body {
     pub result_in_memory: bool,
     /// POUs this body calls.
     pub calls: std::collections::BTreeSet<u32>,
+    /// A statement was left out: the POU's name. An error must have said why.
+    pub dropped: Option<crate::diagnostic::Span>,
     /// Located bytes read and written: (statement, area address, bytes, bit, write).
     pub located: Vec<LocatedUse>,
 }

@@ -96,7 +96,8 @@ pub fn duration(text: &str) -> Result<i64, LiteralError> {
     let mut last_unit: Option<usize> = None;
     let mut fraction_seen = false;
     while !rest.is_empty() {
-        let number_len = rest.find(|c: char| !c.is_ascii_digit() && c != '.' && c != '_').unwrap_or(rest.len());
+        let number_len =
+            rest.find(|c: char| !c.is_ascii_digit() && c != '.' && c != '_').unwrap_or(rest.len());
         let number: String = rest[..number_len].chars().filter(|c| *c != '_').collect();
         let after = &rest[number_len..];
         let unit_len = after.find(|c: char| !c.is_ascii_alphabetic()).unwrap_or(after.len());

@@ -118,10 +118,17 @@ pub struct TypeSpec {
 #[derive(Debug, Clone)]
 pub enum TypeSpecKind {
     Named(Ident),
-    Array { dims: Vec<(Expr, Expr)>, of: Box<TypeSpec> },
+    Array {
+        dims: Vec<(Expr, Expr)>,
+        of: Box<TypeSpec>,
+    },
     Struct(Vec<VarDecl>),
     Enum(Vec<(Ident, Option<Expr>)>),
-    Subrange { base: Ident, lo: Box<Expr>, hi: Box<Expr> },
+    Subrange {
+        base: Ident,
+        lo: Box<Expr>,
+        hi: Box<Expr>,
+    },
     /// Something that was reported already.
     Error,
 }

@@ -86,7 +86,9 @@ impl Parser<'_> {
         let before = self.at;
         let result = match self.kind() {
             TokenKind::Word(Some(Keyword::Task)) => self.task().map(|t| resource.tasks.push(t)),
-            TokenKind::Word(Some(Keyword::Program)) => self.program_instance().map(|p| resource.programs.push(p)),
+            TokenKind::Word(Some(Keyword::Program)) => {
+                self.program_instance().map(|p| resource.programs.push(p))
+            }
             TokenKind::Word(Some(Keyword::VarGlobal)) => {
                 resource.globals.extend(self.var_block());
                 Ok(())
@@ -99,8 +101,11 @@ impl Parser<'_> {
         };
         if result.is_err() {
             self.skip_to(|k| {
-                matches!(k, TokenKind::Semi | TokenKind::Word(Some(Keyword::Task | Keyword::Program | Keyword::EndConfiguration)))
-                    || k == TokenKind::Word(Some(end))
+                matches!(
+                    k,
+                    TokenKind::Semi
+                        | TokenKind::Word(Some(Keyword::Task | Keyword::Program | Keyword::EndConfiguration))
+                ) || k == TokenKind::Word(Some(end))
                     || is_top(k)
             });
             self.eat(TokenKind::Semi);

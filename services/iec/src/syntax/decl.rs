@@ -1,6 +1,8 @@
 //! Declarations: POUs, variables, types.
 
-use super::ast::{Expr, Ident, Init, Pou, PouKind, Section, TypeDecl, TypeSpec, TypeSpecKind, Unit, VarBlock, VarDecl};
+use super::ast::{
+    Expr, Ident, Init, Pou, PouKind, Section, TypeDecl, TypeSpec, TypeSpecKind, Unit, VarBlock, VarDecl,
+};
 use super::{Parsed, Parser, Skip, is_boundary};
 use crate::diagnostic::{Diagnostic, Span};
 use crate::lexer::{Keyword, TokenKind};
@@ -17,7 +19,9 @@ impl Parser<'_> {
                     return unit;
                 }
                 if !reported {
-                    let _ = self.unexpected::<()>("PROGRAM, FUNCTION, FUNCTION_BLOCK, TYPE, VAR_GLOBAL or CONFIGURATION");
+                    let _ = self.unexpected::<()>(
+                        "PROGRAM, FUNCTION, FUNCTION_BLOCK, TYPE, VAR_GLOBAL or CONFIGURATION",
+                    );
                     reported = true;
                 }
                 self.bump();
@@ -30,7 +34,11 @@ impl Parser<'_> {
                 Keyword::Type => self.types(&mut unit),
                 Keyword::VarGlobal => unit.globals.extend(self.var_block()),
                 Keyword::Configuration => unit.configurations.extend(self.configuration()),
-                Keyword::Class | Keyword::Interface | Keyword::Namespace | Keyword::Using | Keyword::Method => {
+                Keyword::Class
+                | Keyword::Interface
+                | Keyword::Namespace
+                | Keyword::Using
+                | Keyword::Method => {
                     let d = Diagnostic::new("E0904", start, format!("{} is not supported yet", word.text()));
                     self.report(d);
                     self.bump();
@@ -53,8 +61,9 @@ impl Parser<'_> {
                 }
                 _ => {
                     if !reported {
-                        let _ = self
-                            .unexpected::<()>("PROGRAM, FUNCTION, FUNCTION_BLOCK, TYPE, VAR_GLOBAL or CONFIGURATION");
+                        let _ = self.unexpected::<()>(
+                            "PROGRAM, FUNCTION, FUNCTION_BLOCK, TYPE, VAR_GLOBAL or CONFIGURATION",
+                        );
                     }
                     self.bump();
                     self.skip_to(is_top);
@@ -80,7 +89,8 @@ impl Parser<'_> {
         }
         for word in [Keyword::Extends, Keyword::Implements] {
             if self.at_kw(word) {
-                let d = Diagnostic::new("E0904", self.span(), format!("{} is not supported yet", word.text()));
+                let d =
+                    Diagnostic::new("E0904", self.span(), format!("{} is not supported yet", word.text()));
                 self.report(d);
                 self.skip_to(|k| matches!(k, TokenKind::Word(Some(k)) if is_boundary(k)));
             }
@@ -134,9 +144,13 @@ impl Parser<'_> {
             let TokenKind::Word(Some(word)) = self.kind() else { return body };
             match word {
                 Keyword::Step | Keyword::InitialStep | Keyword::Transition | Keyword::Action => {
-                    let d = Diagnostic::new("E0902", self.span(), "Sequential Function Chart (SFC) is not supported yet")
-                        .label("this is an SFC element")
-                        .help("write the sequence in Structured Text, for example as a CASE over a step number");
+                    let d = Diagnostic::new(
+                        "E0902",
+                        self.span(),
+                        "Sequential Function Chart (SFC) is not supported yet",
+                    )
+                    .label("this is an SFC element")
+                    .help("write the sequence in Structured Text, for example as a CASE over a step number");
                     self.report(d);
                     self.skip_to(|k| k == TokenKind::Word(Some(end_word)) || is_top(k));
                     return body;
@@ -144,7 +158,8 @@ impl Parser<'_> {
                 k if k == end_word => return body,
                 k if is_top(TokenKind::Word(Some(k))) || is_pou_end(TokenKind::Word(Some(k))) => return body,
                 k => {
-                    let d = Diagnostic::new("E0206", self.span(), format!("`{}` does not belong here", k.text()));
+                    let d =
+                        Diagnostic::new("E0206", self.span(), format!("`{}` does not belong here", k.text()));
                     self.report(d);
                     self.bump();
                     self.eat(TokenKind::Semi);
@@ -194,7 +209,11 @@ impl Parser<'_> {
             self.bump();
         }
         while !self.at_kw(Keyword::EndVar) {
-            if self.kind() == TokenKind::Eof || is_top(self.kind()) || is_pou_end(self.kind()) || is_section(self.kind()) {
+            if self.kind() == TokenKind::Eof
+                || is_top(self.kind())
+                || is_pou_end(self.kind())
+                || is_section(self.kind())
+            {
                 break;
             }
             let before = self.at;
@@ -318,7 +337,11 @@ impl Parser<'_> {
         let mut dims: Vec<(Expr, Expr)> = Vec::new();
         loop {
             if self.kind() == TokenKind::Star {
-                let d = Diagnostic::new("E0904", self.span(), "arrays of variable length (`*`) are not supported yet");
+                let d = Diagnostic::new(
+                    "E0904",
+                    self.span(),
+                    "arrays of variable length (`*`) are not supported yet",
+                );
                 self.report(d);
                 return Err(Skip);
             }
@@ -327,7 +350,11 @@ impl Parser<'_> {
             let hi = self.expr()?;
             dims.push((lo, hi));
             if dims.len() > limits::ARRAY_DIMS {
-                let d = Diagnostic::new("E0801", self.last_span(), format!("more than {} dimensions", limits::ARRAY_DIMS));
+                let d = Diagnostic::new(
+                    "E0801",
+                    self.last_span(),
+                    format!("more than {} dimensions", limits::ARRAY_DIMS),
+                );
                 self.report(d);
                 return Err(Skip);
             }
@@ -349,7 +376,8 @@ impl Parser<'_> {
             let value = if self.eat(TokenKind::Assign) { Some(self.expr()?) } else { None };
             values.push((name, value));
             if values.len() > limits::CHAIN {
-                let d = Diagnostic::new("E0801", self.last_span(), format!("more than {} values", limits::CHAIN));
+                let d =
+                    Diagnostic::new("E0801", self.last_span(), format!("more than {} values", limits::CHAIN));
                 self.report(d);
                 return Err(Skip);
             }
@@ -401,18 +429,14 @@ impl Parser<'_> {
 
     /// `5`, `3(0)`, `2([1, 2])`
     fn array_item(&mut self) -> Parsed<(Option<Expr>, Init)> {
-        let repeated = matches!(self.kind(), TokenKind::Int | TokenKind::BasedInt | TokenKind::Word(None))
-            && self.peek(1) == TokenKind::LParen;
-        if !repeated || (matches!(self.kind(), TokenKind::Word(_)) && !self.is_plain_repeat()) {
+        // Only numbers repeat: a name before a parenthesis is a call.
+        let repeated =
+            matches!(self.kind(), TokenKind::Int | TokenKind::BasedInt) && self.peek(1) == TokenKind::LParen;
+        if !repeated {
             return Ok((None, self.init()?));
         }
         let span = self.span();
-        let count = if let TokenKind::Word(_) = self.kind() {
-            let name = self.ident("a constant")?;
-            Expr { span, kind: super::ast::ExprKind::Name(name) }
-        } else {
-            self.primary_literal()?
-        };
+        let count = self.primary_literal()?;
         self.expect(TokenKind::LParen)?;
         if self.eat(TokenKind::RParen) {
             // `3()` is three times the type's own initial value.
@@ -421,12 +445,6 @@ impl Parser<'_> {
         let value = self.init()?;
         self.expect(TokenKind::RParen)?;
         Ok((Some(count), value))
-    }
-
-    /// `N(0)` repeats, `SQRT(2.0)` calls: a call's name is followed by arguments of its own, so names never repeat
-    /// here. Write the count as a number.
-    fn is_plain_repeat(&self) -> bool {
-        false
     }
 
     fn types(&mut self, unit: &mut Unit) {
@@ -441,7 +459,9 @@ impl Parser<'_> {
                 Ok(t) => unit.types.push(t),
                 Err(Skip) => {
                     self.skip_to(|k| {
-                        matches!(k, TokenKind::Semi | TokenKind::Word(Some(Keyword::EndType))) || is_top(k) || is_pou_end(k)
+                        matches!(k, TokenKind::Semi | TokenKind::Word(Some(Keyword::EndType)))
+                            || is_top(k)
+                            || is_pou_end(k)
                     });
                     self.eat(TokenKind::Semi);
                     if self.at == before {
@@ -451,7 +471,8 @@ impl Parser<'_> {
             }
         }
         if !self.eat_kw(Keyword::EndType) {
-            let d = Diagnostic::new("E0207", self.span(), "expected `END_TYPE`").also(opened, "to close this TYPE");
+            let d = Diagnostic::new("E0207", self.span(), "expected `END_TYPE`")
+                .also(opened, "to close this TYPE");
             self.report(d);
         }
         self.eat(TokenKind::Semi);
@@ -508,7 +529,10 @@ pub(super) fn is_top(k: TokenKind) -> bool {
 
 fn is_pou_end(k: TokenKind) -> bool {
     use Keyword::*;
-    matches!(k, TokenKind::Word(Some(EndProgram | EndFunction | EndFunctionBlock | EndConfiguration | EndResource)))
+    matches!(
+        k,
+        TokenKind::Word(Some(EndProgram | EndFunction | EndFunctionBlock | EndConfiguration | EndResource))
+    )
 }
 
 fn is_section(k: TokenKind) -> bool {

@@ -58,8 +58,12 @@ impl Parser<'_> {
             // Trees as deep as a long chain are walked by recursion later.
             self.operators += 1;
             if self.operators > limits::OPERATORS {
-                let d = Diagnostic::new("E0801", op_span, format!("more than {} operators in one expression", limits::OPERATORS))
-                    .help("split the expression with a variable");
+                let d = Diagnostic::new(
+                    "E0801",
+                    op_span,
+                    format!("more than {} operators in one expression", limits::OPERATORS),
+                )
+                .help("split the expression with a variable");
                 self.report(d);
                 return Err(Skip);
             }
@@ -92,7 +96,11 @@ impl Parser<'_> {
         loop {
             links += 1;
             if links > limits::NESTING {
-                let d = Diagnostic::new("E0801", self.span(), format!("path has more than {} parts", limits::NESTING));
+                let d = Diagnostic::new(
+                    "E0801",
+                    self.span(),
+                    format!("path has more than {} parts", limits::NESTING),
+                );
                 self.report(d);
                 return Err(Skip);
             }
@@ -101,8 +109,12 @@ impl Parser<'_> {
                     self.bump();
                     if matches!(self.kind(), TokenKind::Int | TokenKind::Direct) {
                         let span = e.span.to(self.span());
-                        let d = Diagnostic::new("E0904", span, "access to a part of a variable (`w.3`, `w.%X3`) is not supported yet")
-                            .help("use a mask: (w AND 16#0008) <> 0, or SHR");
+                        let d = Diagnostic::new(
+                            "E0904",
+                            span,
+                            "access to a part of a variable (`w.3`, `w.%X3`) is not supported yet",
+                        )
+                        .help("use a mask: (w AND 16#0008) <> 0, or SHR");
                         self.report(d);
                         self.bump();
                         e = Expr { span, kind: ExprKind::Error };
@@ -149,7 +161,8 @@ impl Parser<'_> {
         loop {
             args.push(self.arg()?);
             if args.len() > limits::CHAIN {
-                let d = Diagnostic::new("E0801", self.span(), format!("more than {} parameters", limits::CHAIN));
+                let d =
+                    Diagnostic::new("E0801", self.span(), format!("more than {} parameters", limits::CHAIN));
                 self.report(d);
                 return Err(Skip);
             }
@@ -171,13 +184,25 @@ impl Parser<'_> {
         }
         if !(is_word(self.kind()) && names(self.peek(1))) {
             let value = self.expr()?;
-            return Ok(Arg { name: None, output: false, negated: false, span: value.span, value: Some(value) });
+            return Ok(Arg {
+                name: None,
+                output: false,
+                negated: false,
+                span: value.span,
+                value: Some(value),
+            });
         }
         let name = self.ident("a parameter name")?;
         let output = self.kind() == TokenKind::Arrow;
         self.bump();
         if output && matches!(self.kind(), TokenKind::Comma | TokenKind::RParen) {
-            return Ok(Arg { name: Some(name), output, negated, value: None, span: start.to(self.last_span()) });
+            return Ok(Arg {
+                name: Some(name),
+                output,
+                negated,
+                value: None,
+                span: start.to(self.last_span()),
+            });
         }
         let value = self.expr()?;
         Ok(Arg { name: Some(name), output, negated, span: start.to(value.span), value: Some(value) })
@@ -196,17 +221,18 @@ impl Parser<'_> {
             TokenKind::Int | TokenKind::BasedInt => {
                 let value = literal::integer(self.slice());
                 self.bump();
-                value.map(ExprKind::Int).unwrap_or_else(|e| self.bad_literal(span, e))
+                value.map_or_else(|e| self.bad_literal(span, e), ExprKind::Int)
             }
             TokenKind::Real => {
                 let value = literal::real_text(self.slice());
                 self.bump();
-                value.map(ExprKind::Real).unwrap_or_else(|e| self.bad_literal(span, e))
+                value.map_or_else(|e| self.bad_literal(span, e), ExprKind::Real)
             }
             TokenKind::Typed => {
                 let (prefix, rest) = self.slice().split_once('#').unwrap_or(("", ""));
                 let prefix_span = Span { end: span.start + prefix.len() as u32, ..span };
-                let kind = ExprKind::Typed(Ident { text: prefix.to_owned(), span: prefix_span }, rest.to_owned());
+                let kind =
+                    ExprKind::Typed(Ident { text: prefix.to_owned(), span: prefix_span }, rest.to_owned());
                 self.bump();
                 kind
             }

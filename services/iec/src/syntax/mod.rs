@@ -48,9 +48,27 @@ fn read(file: u32, text: &str, statements: &mut StatementTable, library: bool) -
     }
     let (mut tokens, diags) = lexer::lex(file, text);
     free_sfc_words(&mut tokens);
-    let mut parser = Parser { file, text, tokens, at: 0, diags, depth: 0, expr_level: 0, operators: 0, statements, full: false, library };
+    let mut parser = Parser {
+        file,
+        text,
+        tokens,
+        at: 0,
+        diags,
+        depth: 0,
+        expr_level: 0,
+        operators: 0,
+        statements,
+        full: false,
+        library,
+    };
     let unit = parser.unit();
     let mut diags = parser.diags;
+    // A comment that swallowed the rest of the file: what is missing after it is no news.
+    let open =
+        diags.iter().find(|d| d.code == "E0102").and_then(|d| d.primary.as_ref()).map(|p| p.span.start);
+    if let Some(open) = open {
+        diags.retain(|d| d.primary.as_ref().is_none_or(|p| p.span.start <= open));
+    }
     let errors = diags.iter().filter(|d| d.code.starts_with('E')).count();
     if errors > limits::ERRORS_PER_FILE {
         diags.truncate(limits::ERRORS_PER_FILE);
@@ -63,7 +81,9 @@ fn read(file: u32, text: &str, statements: &mut StatementTable, library: bool) -
 fn free_sfc_words(tokens: &mut [Token]) {
     for i in 0..tokens.len().saturating_sub(1) {
         let is_name = tokens[i + 1].kind == TokenKind::Word(None);
-        if let TokenKind::Word(Some(Keyword::Step | Keyword::InitialStep | Keyword::Transition | Keyword::Action)) = tokens[i].kind
+        if let TokenKind::Word(Some(
+            Keyword::Step | Keyword::InitialStep | Keyword::Transition | Keyword::Action,
+        )) = tokens[i].kind
             && !is_name
         {
             tokens[i].kind = TokenKind::Word(None);
@@ -216,8 +236,12 @@ impl Parser<'_> {
                 Ok(ident)
             }
             TokenKind::Word(Some(k)) => {
-                let d = Diagnostic::new("E0203", self.span(), format!("`{}` is a reserved word and cannot be {what}", k.text()))
-                    .help("choose another name");
+                let d = Diagnostic::new(
+                    "E0203",
+                    self.span(),
+                    format!("`{}` is a reserved word and cannot be {what}", k.text()),
+                )
+                .help("choose another name");
                 self.report(d);
                 Err(Skip)
             }
@@ -230,12 +254,20 @@ impl Parser<'_> {
             let d = Diagnostic::new(
                 "E0802",
                 ident.span,
-                format!("name has {} characters, at most {} are allowed", ident.text.len(), limits::IDENT_CHARS),
+                format!(
+                    "name has {} characters, at most {} are allowed",
+                    ident.text.len(),
+                    limits::IDENT_CHARS
+                ),
             );
             self.report(d);
         } else if (ident.text.contains("__") || ident.text.ends_with('_')) && !self.is_library() {
-            let d = Diagnostic::new("E0204", ident.span, format!("`{}`: underscores in a name stand alone and not at its end", ident.text))
-                .help("the standard forbids `__` and a final `_`");
+            let d = Diagnostic::new(
+                "E0204",
+                ident.span,
+                format!("`{}`: underscores in a name stand alone and not at its end", ident.text),
+            )
+            .help("the standard forbids `__` and a final `_`");
             self.report(d);
         }
     }
@@ -248,8 +280,12 @@ impl Parser<'_> {
     /// Runs `f` one level deeper, or reports that the nesting is too deep.
     fn nested<T>(&mut self, f: impl FnOnce(&mut Self) -> Parsed<T>) -> Parsed<T> {
         if self.depth >= limits::NESTING {
-            let d = Diagnostic::new("E0801", self.span(), format!("nesting is more than {} deep", limits::NESTING))
-                .help("split the expression or move statements into a function");
+            let d = Diagnostic::new(
+                "E0801",
+                self.span(),
+                format!("nesting is more than {} deep", limits::NESTING),
+            )
+            .help("split the expression or move statements into a function");
             self.report(d);
             return Err(Skip);
         }
@@ -264,7 +300,8 @@ impl Parser<'_> {
         if self.statements.spans.len() > limits::STATEMENTS {
             if !self.full {
                 self.full = true;
-                let d = Diagnostic::new("E0803", span, format!("more than {} statements", limits::STATEMENTS));
+                let d =
+                    Diagnostic::new("E0803", span, format!("more than {} statements", limits::STATEMENTS));
                 self.report(d);
             }
             return 0;

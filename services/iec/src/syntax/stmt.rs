@@ -8,8 +8,9 @@ use crate::limits;
 
 /// Instruction List operators that start a line and are no names in ST by accident.
 const IL_OPERATORS: &[&str] = &[
-    "LD", "LDN", "ST", "STN", "S", "R", "AND", "ANDN", "OR", "ORN", "XOR", "XORN", "ADD", "SUB", "MUL", "DIV", "MOD",
-    "GT", "GE", "EQ", "NE", "LE", "LT", "JMP", "JMPC", "JMPCN", "CAL", "CALC", "CALCN", "RET", "RETC", "RETCN", "NOT",
+    "LD", "LDN", "ST", "STN", "S", "R", "AND", "ANDN", "OR", "ORN", "XOR", "XORN", "ADD", "SUB", "MUL",
+    "DIV", "MOD", "GT", "GE", "EQ", "NE", "LE", "LT", "JMP", "JMPC", "JMPCN", "CAL", "CALC", "CALCN", "RET",
+    "RETC", "RETCN", "NOT",
 ];
 
 impl Parser<'_> {
@@ -80,7 +81,8 @@ impl Parser<'_> {
             TokenKind::Word(Some(Keyword::Continue)) => self.word_statement(StmtKind::Continue, "CONTINUE"),
             TokenKind::Word(Some(Keyword::Return)) => self.word_statement(StmtKind::Return, "RETURN"),
             TokenKind::Word(Some(Keyword::Super | Keyword::This)) => {
-                let d = Diagnostic::new("E0904", start, "object orientation (SUPER, THIS) is not supported yet");
+                let d =
+                    Diagnostic::new("E0904", start, "object orientation (SUPER, THIS) is not supported yet");
                 self.report(d);
                 Err(Skip)
             }
@@ -127,7 +129,8 @@ impl Parser<'_> {
                 Ok(Stmt { id, span, kind: StmtKind::Assign { target, value } })
             }
             TokenKind::TryAssign => {
-                let d = Diagnostic::new("E0904", self.span(), "assignment attempt (`?=`) is not supported yet");
+                let d =
+                    Diagnostic::new("E0904", self.span(), "assignment attempt (`?=`) is not supported yet");
                 self.report(d);
                 Err(Skip)
             }
@@ -154,7 +157,9 @@ impl Parser<'_> {
     fn expr_statement_head(&mut self) -> Parsed<Expr> {
         match self.kind() {
             TokenKind::Word(None) | TokenKind::Direct => self.expr_path(),
-            TokenKind::Word(Some(Keyword::And | Keyword::Or | Keyword::Xor | Keyword::Mod)) => self.expr_path(),
+            TokenKind::Word(Some(Keyword::And | Keyword::Or | Keyword::Xor | Keyword::Mod)) => {
+                self.expr_path()
+            }
             TokenKind::Word(Some(k)) => {
                 let d = Diagnostic::new("E0206", self.span(), format!("`{}` does not belong here", k.text()))
                     .label("expected a statement");
@@ -187,7 +192,10 @@ impl Parser<'_> {
             | TokenKind::Typed
             | TokenKind::Direct
             | TokenKind::Minus => true,
-            _ => ["RET", "RETC", "RETCN"].iter().any(|op| word.eq_ignore_ascii_case(op)) && self.peek(1) != TokenKind::Assign,
+            _ => {
+                ["RET", "RETC", "RETCN"].iter().any(|op| word.eq_ignore_ascii_case(op))
+                    && self.peek(1) != TokenKind::Assign
+            }
         }
     }
 
@@ -201,7 +209,9 @@ impl Parser<'_> {
             let cond = match self.expr() {
                 Ok(c) => c,
                 Err(Skip) => {
-                    self.skip_to(|k| matches!(k, TokenKind::Word(Some(Keyword::Then)) | TokenKind::Semi) || closes(k));
+                    self.skip_to(|k| {
+                        matches!(k, TokenKind::Word(Some(Keyword::Then)) | TokenKind::Semi) || closes(k)
+                    });
                     Expr { span: head, kind: ExprKind::Error }
                 }
             };
@@ -267,7 +277,8 @@ impl Parser<'_> {
             }
         }
         if label_count > limits::CASE_LABELS {
-            let d = Diagnostic::new("E0801", span, format!("CASE has more than {} labels", limits::CASE_LABELS));
+            let d =
+                Diagnostic::new("E0801", span, format!("CASE has more than {} labels", limits::CASE_LABELS));
             self.report(d);
         }
         self.close(Keyword::EndCase, start)?;
@@ -321,7 +332,9 @@ impl Parser<'_> {
     /// A literal starts no statement; a name starts a label when `:`, `,` or `..` follows.
     fn at_case_label(&self) -> bool {
         match self.kind() {
-            TokenKind::Int | TokenKind::BasedInt | TokenKind::Typed | TokenKind::Minus | TokenKind::Plus => true,
+            TokenKind::Int | TokenKind::BasedInt | TokenKind::Typed | TokenKind::Minus | TokenKind::Plus => {
+                true
+            }
             TokenKind::Word(Some(Keyword::True | Keyword::False)) => true,
             TokenKind::LParen => true,
             TokenKind::Word(None) => {

@@ -196,7 +196,8 @@ impl<'a> Code<'a> {
         let mut param = 0;
         for (i, v) in self.pou.vars.iter().enumerate() {
             let i = i as u32;
-            let is_param = self.pou.kind == PouKind::Function && matches!(v.section, Section::Input | Section::InOut);
+            let is_param =
+                self.pou.kind == PouKind::Function && matches!(v.section, Section::Input | Section::InOut);
             let register = param;
             param += u32::from(is_param);
             if v.external.is_some() || v.located.is_some() || (v.constant && v.value.is_some()) {
@@ -234,7 +235,8 @@ impl<'a> Code<'a> {
         let mut param = 0;
         for (i, v) in self.pou.vars.iter().enumerate() {
             let i = i as u32;
-            let is_param = self.pou.kind == PouKind::Function && matches!(v.section, Section::Input | Section::InOut);
+            let is_param =
+                self.pou.kind == PouKind::Function && matches!(v.section, Section::Input | Section::InOut);
             let register = param;
             param += u32::from(is_param);
             let slot = self.vars.get(&i).copied();
@@ -290,7 +292,8 @@ impl<'a> Code<'a> {
         let value = self.initial(e, ty, init);
         match slot {
             // Registers are zero at entry.
-            Slot::Register(_) if value == Const::I(0) || value == Const::F32(0.0) || value == Const::F64(0.0) => {}
+            Slot::Register(_)
+                if value == Const::I(0) || value == Const::F32(0.0) || value == Const::F64(0.0) => {}
             Slot::Register(r) => {
                 self.constant(e, value);
                 self.op(I::LocalSet(r));

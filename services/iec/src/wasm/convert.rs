@@ -60,8 +60,8 @@ impl Code<'_> {
                 }
                 self.op(if how == Convert::Round { I::F64Nearest } else { I::F64Trunc });
                 match self.options.real_to_int {
-                    RealToInt::Fault => self.to_int_checked(to),
-                    RealToInt::Clamp => self.to_int_clamped(to),
+                    RealToInt::Fault => self.int_checked(to),
+                    RealToInt::Clamp => self.int_clamped(to),
                 }
             }
         }
@@ -86,7 +86,7 @@ impl Code<'_> {
     }
 
     /// A whole `f64` on the stack to an integer, or a fault.
-    fn to_int_checked(&mut self, to: ElemType) {
+    fn int_checked(&mut self, to: ElemType) {
         let x = self.take(ValType::F64);
         self.op(I::LocalSet(x));
         if to.is_wide() {
@@ -128,7 +128,7 @@ impl Code<'_> {
     }
 
     /// A whole `f64` on the stack to the nearest value of an integer type; NaN to 0.
-    fn to_int_clamped(&mut self, to: ElemType) {
+    fn int_clamped(&mut self, to: ElemType) {
         let (lo, hi) = to.range();
         if to.bits() < 32 {
             self.op(I::F64Const((lo as f64).into()));

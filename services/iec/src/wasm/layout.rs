@@ -54,7 +54,7 @@ impl Cursor {
 }
 
 /// Lays everything out; `Err` when it does not fit.
-pub fn lay_out(a: &Analyzed, options: &Options) -> Result<Memory, Diagnostic> {
+pub fn lay_out(a: &Analyzed, options: &Options) -> Result<Memory, Box<Diagnostic>> {
     let t = &a.tables;
     let start = t.image.end;
     let mut retain = Cursor(u64::from(start));
@@ -75,9 +75,13 @@ pub fn lay_out(a: &Analyzed, options: &Options) -> Result<Memory, Diagnostic> {
     let retain_bytes = retain.0 - u64::from(start);
     if retain_bytes > u64::from(options.retain_max) {
         let span = first_retain(a);
-        let message = format!("RETAIN variables need {retain_bytes} bytes, {} are allowed", options.retain_max);
-        let d = span.map_or_else(|| Diagnostic::placeless("E0806", &message), |s| Diagnostic::new("E0806", s, &message));
-        return Err(d.help("make fewer variables RETAIN"));
+        let message =
+            format!("RETAIN variables need {retain_bytes} bytes, {} are allowed", options.retain_max);
+        let d = span.map_or_else(
+            || Diagnostic::placeless("E0806", &message),
+            |s| Diagnostic::new("E0806", s, &message),
+        );
+        return Err(Box::new(d.help("make fewer variables RETAIN")));
     }
     let mut data = Cursor(retain.0.next_multiple_of(8));
     let data_start = data.0;
@@ -113,8 +117,13 @@ pub fn lay_out(a: &Analyzed, options: &Options) -> Result<Memory, Diagnostic> {
     }
     let end = temp.0.next_multiple_of(8);
     if end > limits::MEMORY_BYTES {
-        return Err(Diagnostic::placeless("E0805", format!("the program needs {end} bytes of memory, {} are allowed", limits::MEMORY_BYTES))
-            .help("make arrays smaller"));
+        return Err(Box::new(
+            Diagnostic::placeless(
+                "E0805",
+                format!("the program needs {end} bytes of memory, {} are allowed", limits::MEMORY_BYTES),
+            )
+            .help("make arrays smaller"),
+        ));
     }
     let area = |offset: u64, end: u64| Area { offset: offset as u32, bytes: (end - offset) as u32 };
     let layout = Layout {
@@ -165,7 +174,11 @@ fn templates(a: &Analyzed, frames: &mut [Frame], data: &mut Cursor) {
             continue;
         }
         for (i, v) in pou.vars.iter().enumerate() {
-            if is_temporary(pou.kind, v) && v.ty.elem().is_none() && v.section != Section::Input && !zero(t, &v.ty, &v.init) {
+            if is_temporary(pou.kind, v)
+                && v.ty.elem().is_none()
+                && v.section != Section::Input
+                && !zero(t, &v.ty, &v.init)
+            {
                 frames[p].templates.insert(i as u32, data.take(t.size_of(&v.ty), t.align_of(&v.ty)));
             }
         }

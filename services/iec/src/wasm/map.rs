@@ -3,7 +3,8 @@
 use super::layout::Memory;
 use crate::analyze::tables::{Analyzed, Located, Var};
 use crate::artifact::{
-    ARTIFACT_VERSION, Access, AreaKind, DebugMap, ElemType, FunctionLines, Instance, Place, Storage, Symbol, Task, VarKind,
+    ARTIFACT_VERSION, Access, AreaKind, DebugMap, ElemType, FunctionLines, Instance, Place, Storage, Symbol,
+    Task, VarKind,
 };
 use crate::diagnostic::{Diagnostic, Span};
 use crate::syntax::ast::Section;
@@ -19,14 +20,24 @@ pub fn build(
     sources: &[Source],
     options: &Options,
     functions: Vec<FunctionLines>,
-) -> Result<DebugMap, Diagnostic> {
+) -> Result<DebugMap, Box<Diagnostic>> {
     let mut places = Places::new(sources);
-    let mut b = Builder { a, memory, symbols: Vec::new(), instances: Vec::new(), used: [0; 3], places: &mut places, full: false };
+    let mut b = Builder {
+        a,
+        memory,
+        symbols: Vec::new(),
+        instances: Vec::new(),
+        used: [0; 3],
+        places: &mut places,
+        full: false,
+    };
     b.globals();
     b.programs();
     if b.full {
-        return Err(Diagnostic::placeless("E0803", format!("the program has more than {} symbols", limits::SYMBOLS))
-            .help("use arrays instead of many instances"));
+        return Err(Box::new(
+            Diagnostic::placeless("E0803", format!("the program has more than {} symbols", limits::SYMBOLS))
+                .help("use arrays instead of many instances"),
+        ));
     }
     let (mut reads, mut writes) = (Vec::new(), Vec::new());
     for p in reached {
@@ -151,7 +162,13 @@ impl Builder<'_> {
                 continue;
             }
             let kind = if v.mapped.is_some() { VarKind::Mapped } else { VarKind::Global };
-            let cx = Context { kind, retain: v.retain, span: v.name.span, mapped: v.mapped.is_some(), located: v.located.as_ref() };
+            let cx = Context {
+                kind,
+                retain: v.retain,
+                span: v.name.span,
+                mapped: v.mapped.is_some(),
+                located: v.located.as_ref(),
+            };
             self.variable(&v.name.text, &v.ty, *at, cx);
         }
     }
@@ -168,7 +185,13 @@ impl Builder<'_> {
             });
             for (v, at) in pou.vars.iter().zip(&inst.vars) {
                 if let Some((kind, located)) = visible(v) {
-                    let cx = Context { kind, retain: v.retain || info.retain, span: v.name.span, mapped: false, located };
+                    let cx = Context {
+                        kind,
+                        retain: v.retain || info.retain,
+                        span: v.name.span,
+                        mapped: false,
+                        located,
+                    };
                     self.variable(&format!("{}.{}", info.name, v.name.text), &v.ty, *at, cx);
                 }
             }
@@ -263,10 +286,13 @@ impl Builder<'_> {
                 self.used[slot] = self.used[slot].max(located.address.byte + bytes);
                 located.address.area
             }
-            None if offset >= l.retain.offset && offset < l.retain.offset + l.retain.bytes => AreaKind::Retain,
+            None if offset >= l.retain.offset && offset < l.retain.offset + l.retain.bytes => {
+                AreaKind::Retain
+            }
             None => AreaKind::Data,
         };
-        let (line, column) = if cx.mapped { (0, 0) } else { self.places.line_column(cx.span.file, cx.span.start) };
+        let (line, column) =
+            if cx.mapped { (0, 0) } else { self.places.line_column(cx.span.file, cx.span.start) };
         self.symbols.push(Symbol {
             path: path.to_owned(),
             elem,
@@ -294,7 +320,8 @@ impl Builder<'_> {
             } else {
                 (AreaKind::Marker, image.marker)
             };
-            let access = Access { area, byte: u.address - start, bytes: u.bytes, bit: u.bit, statement: u.statement };
+            let access =
+                Access { area, byte: u.address - start, bytes: u.bytes, bit: u.bit, statement: u.statement };
             let list = if u.write { &mut *writes } else { &mut *reads };
             if list.last() != Some(&access) {
                 list.push(access);

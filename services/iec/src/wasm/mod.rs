@@ -13,8 +13,9 @@ use std::borrow::Cow;
 use std::collections::{BTreeSet, HashMap};
 
 use wasm_encoder::{
-    CodeSection, ConstExpr, CustomSection, DataSection, EntityType, ExportKind, ExportSection, FunctionSection,
-    ImportSection, MemorySection, MemoryType, Module, NameMap, NameSection, TypeSection, ValType,
+    CodeSection, ConstExpr, CustomSection, DataSection, EntityType, ExportKind, ExportSection,
+    FunctionSection, ImportSection, MemorySection, MemoryType, Module, NameMap, NameSection, TypeSection,
+    ValType,
 };
 
 use crate::analyze::tables::Analyzed;
@@ -66,7 +67,12 @@ impl Types {
 }
 
 /// Makes the module.
-pub fn emit(a: &Analyzed, statements: &[Span], sources: &[Source], options: &Options) -> Result<Artifact, Diagnostic> {
+pub fn emit(
+    a: &Analyzed,
+    statements: &[Span],
+    sources: &[Source],
+    options: &Options,
+) -> Result<Artifact, Box<Diagnostic>> {
     let memory = layout::lay_out(a, options)?;
     let reached = reachable(a);
     let mut types = Types::default();
@@ -99,7 +105,8 @@ pub fn emit(a: &Analyzed, statements: &[Span], sources: &[Source], options: &Opt
         next += 1;
         next - 1
     };
-    let trap_type = types.get(vec![ValType::I32, ValType::I32, ValType::I32, ValType::I64, ValType::F64], vec![]);
+    let trap_type =
+        types.get(vec![ValType::I32, ValType::I32, ValType::I32, ValType::I64, ValType::F64], vec![]);
     let trap = define(trap_type, "trap");
     let mut pous = HashMap::new();
     for p in &reached {
@@ -146,13 +153,20 @@ pub fn emit(a: &Analyzed, statements: &[Span], sources: &[Source], options: &Opt
     let map = map::build(a, &memory, &reached, statements, sources, options, lines)?;
     let mut memories = MemorySection::new();
     let pages = u64::from(memory.layout.pages);
-    memories.memory(MemoryType { minimum: pages, maximum: Some(pages), memory64: false, shared: false, page_size_log2: None });
+    memories.memory(MemoryType {
+        minimum: pages,
+        maximum: Some(pages),
+        memory64: false,
+        shared: false,
+        page_size_log2: None,
+    });
     let mut exports = ExportSection::new();
     exports.export("memory", ExportKind::Memory, 0);
     for (t, index) in map.tasks.iter().zip(&tasks) {
         exports.export(&t.export, ExportKind::Func, *index);
     }
-    let json = serde_json::to_vec(&map).map_err(|e| Diagnostic::placeless("E0901", format!("debug map: {e}")))?;
+    let json = serde_json::to_vec(&map)
+        .map_err(|e| Box::new(Diagnostic::placeless("E0901", format!("debug map: {e}"))))?;
     let mut name_section = NameSection::new();
     name_section.functions(&names);
 

@@ -1,6 +1,6 @@
 //! Walks over IR.
 
-use crate::ir::{CallArg, Call, Expr, ExprKind, FbInput, OutputCopy, Place, Step, Stmt, StmtKind};
+use crate::ir::{Call, CallArg, Expr, ExprKind, FbInput, OutputCopy, Place, Step, Stmt, StmtKind};
 
 /// Calls `f` for every expression in a statement, inner ones too.
 pub fn visit_statement(s: &Stmt, f: &mut impl FnMut(&Expr)) {

@@ -6,7 +6,7 @@ use super::code::{Addr, Code, Labels, mem};
 use super::expr::simple;
 use super::val_type;
 use crate::artifact::{ElemType, TrapId, sys};
-use crate::ir::{BinOp, Expr, FbInput, For, OutputCopy, Place, Step, Stmt, StmtKind};
+use crate::ir::{BinOp, CaseArm, Expr, FbInput, For, OutputCopy, Place, Step, Stmt, StmtKind};
 use crate::types::ElemExt;
 
 /// A CASE with this many labels in this span becomes a jump table.
@@ -53,7 +53,9 @@ impl Code<'_> {
                 self.op(I::Drop);
             }
             StmtKind::CallVoid(call) => self.call(call),
-            StmtKind::CallFb { pou, instance, inputs, outputs } => self.call_fb(*pou, instance, inputs, outputs),
+            StmtKind::CallFb { pou, instance, inputs, outputs } => {
+                self.call_fb(*pou, instance, inputs, outputs);
+            }
             StmtKind::If { branches, otherwise } => self.if_chain(branches, otherwise),
             StmtKind::Case { selector, arms, otherwise } => self.case(selector, arms, otherwise),
             StmtKind::For(f) => self.for_loop(f, s.id),
@@ -158,7 +160,7 @@ impl Code<'_> {
         self.close();
     }
 
-    fn case(&mut self, selector: &Expr, arms: &[(Vec<(i64, i64)>, Vec<Stmt>)], otherwise: &[Stmt]) {
+    fn case(&mut self, selector: &Expr, arms: &[CaseArm], otherwise: &[Stmt]) {
         let v = val_type(selector.ty);
         let key = self.take(v);
         self.expr(selector);
@@ -177,8 +179,7 @@ impl Code<'_> {
                 self.op(I::I32Const(lo as i32));
                 self.op(I::I32Sub);
             }
-            let targets: Vec<u32> =
-                table.iter().map(|t| self.to(t.map_or(fallback, arm_label))).collect();
+            let targets: Vec<u32> = table.iter().map(|t| self.to(t.map_or(fallback, arm_label))).collect();
             let default = self.to(fallback);
             self.op(I::BrTable(targets.into(), default));
         } else {
@@ -375,7 +376,9 @@ impl Code<'_> {
 
     /// Pushes whether the variable has passed the end.
     fn passed(&mut self, f: &For, step: &Expr, at: u32, end: u32, by: u32) {
-        let compare = |op| simple(op, if f.ty == ElemType::Ulint { ElemType::Ulint } else { ElemType::Lint }, ValType::I64);
+        let compare = |op| {
+            simple(op, if f.ty == ElemType::Ulint { ElemType::Ulint } else { ElemType::Lint }, ValType::I64)
+        };
         self.op(I::LocalGet(at));
         self.op(I::LocalGet(end));
         self.op(compare(BinOp::Gt));
@@ -456,7 +459,7 @@ impl Code<'_> {
 }
 
 /// Lowest label and the arm of each value from there, where a table pays. The first matching arm counts.
-fn jump_table(e: ElemType, arms: &[(Vec<(i64, i64)>, Vec<Stmt>)]) -> Option<(i64, Vec<Option<usize>>)> {
+fn jump_table(e: ElemType, arms: &[CaseArm]) -> Option<(i64, Vec<Option<usize>>)> {
     let labels = || arms.iter().flat_map(|(l, _)| l);
     let lo = labels().map(|l| l.0).min()?;
     let hi = labels().map(|l| l.1).max()?;

@@ -9,8 +9,10 @@ use crate::host::{Host, Value};
 
 /// Folder of the case files, or `None` with a loud line; a failure when DINRAIL_NO_SKIP=1.
 fn folder() -> Option<PathBuf> {
-    let root = std::env::var_os("DINRAIL_CASES")
-        .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/cases"), PathBuf::from);
+    let root = std::env::var_os("DINRAIL_CASES").map_or_else(
+        || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/cases"),
+        PathBuf::from,
+    );
     let dir = root.join("iec");
     if dir.is_dir() {
         return Some(dir);
@@ -41,7 +43,8 @@ fn run(name: &str) {
             let v = value_of(&host, var, value);
             host.set(var, v);
         }
-        host.scan_at(scan["t_ms"].as_i64().unwrap() * 1_000_000).unwrap_or_else(|f| panic!("{name} scan {n}: {f:?}"));
+        host.scan_at(scan["t_ms"].as_i64().unwrap() * 1_000_000)
+            .unwrap_or_else(|f| panic!("{name} scan {n}: {f:?}"));
         for (var, value) in scan["out"].as_object().unwrap() {
             let expected = value_of(&host, var, value);
             let got = host.get(var);

@@ -64,10 +64,16 @@ fn table_and_compiler_agree() {
 
 #[test]
 fn the_docs_page_lists_every_code() {
-    let page = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/src/reference/diagnostics.md");
+    let page =
+        std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/src/reference/diagnostics.md");
     let text = std::fs::read_to_string(&page).unwrap();
     for c in CODES {
-        assert!(text.contains(&format!("| {} | {} |", c.id, c.title)), "{} is missing in {}", c.id, page.display());
+        assert!(
+            text.contains(&format!("| {} | {} |", c.id, c.title)),
+            "{} is missing in {}",
+            c.id,
+            page.display()
+        );
     }
     let documented = text.lines().filter(|l| l.starts_with("| E0") || l.starts_with("| W0")).count();
     assert_eq!(documented, CODES.len());

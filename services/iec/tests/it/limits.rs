@@ -26,7 +26,9 @@ fn nesting() {
     let parens = |n: usize| program("x : INT;", &format!("x := {}x{};", "(".repeat(n), ")".repeat(n)));
     assert!(errors(&parens(30)).is_empty());
     assert!(errors(&parens(10_000)).contains(&"E0801"));
-    let ifs = |n: usize| program("x : INT;", &format!("{}x := 1;{}", "IF x > 0 THEN ".repeat(n), " END_IF;".repeat(n)));
+    let ifs = |n: usize| {
+        program("x : INT;", &format!("{}x := 1;{}", "IF x > 0 THEN ".repeat(n), " END_IF;".repeat(n)))
+    };
     assert!(errors(&ifs(40)).is_empty());
     assert!(errors(&ifs(10_000)).contains(&"E0801"));
     let nots = program("b : BOOL;", &format!("b := {} b;", "NOT ".repeat(10_000)));
@@ -88,7 +90,10 @@ fn counts() {
     chain.push_str("FUNCTION_BLOCK f100 VAR x : INT; END_VAR END_FUNCTION_BLOCK ");
     assert!(errors(&format!("{chain} PROGRAM p END_PROGRAM")).contains(&"E0801"));
     let tasks: Vec<String> = (0..100).map(|i| format!("TASK t{i}(PRIORITY := 1);")).collect();
-    let config = format!("PROGRAM p END_PROGRAM CONFIGURATION c RESOURCE r ON x {} PROGRAM i WITH t0 : p; END_RESOURCE END_CONFIGURATION", tasks.join(" "));
+    let config = format!(
+        "PROGRAM p END_PROGRAM CONFIGURATION c RESOURCE r ON x {} PROGRAM i WITH t0 : p; END_RESOURCE END_CONFIGURATION",
+        tasks.join(" ")
+    );
     assert_eq!(errors(&config), ["E0803"]);
 }
 

@@ -1,5 +1,8 @@
 //! Tests of the whole compiler: text in, behaviour of the module out.
 
+// Helpers of tests, too, stop at what should not happen.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::enum_glob_use)]
+
 mod cases;
 mod diagnostics;
 mod host;
@@ -7,4 +10,6 @@ mod limits;
 mod map;
 mod operators;
 mod random;
+
+mod stages;
 mod statements;

@@ -8,7 +8,9 @@ use crate::random::SAMPLE;
 
 #[test]
 fn layout_is_in_the_order_of_the_contract() {
-    let h = Host::new("VAR_GLOBAL RETAIN a : LINT; b : BOOL; END_VAR PROGRAM p VAR RETAIN c : DINT := 7; END_VAR VAR d : INT; END_VAR END_PROGRAM");
+    let h = Host::new(
+        "VAR_GLOBAL RETAIN a : LINT; b : BOOL; END_VAR PROGRAM p VAR RETAIN c : DINT := 7; END_VAR VAR d : INT; END_VAR END_PROGRAM",
+    );
     let l = h.artifact.map.layout;
     assert_eq!((l.input.offset, l.input.bytes), (256, 4096));
     assert_eq!((l.output.offset, l.marker.offset, l.retain.offset), (256 + 4096, 256 + 8192, 256 + 12288));
@@ -21,7 +23,10 @@ fn layout_is_in_the_order_of_the_contract() {
         assert_eq!(s.offset % s.elem.bytes(), 0);
         assert_eq!(s.area == AreaKind::Retain, s.retain);
     }
-    let odd = Host::with("PROGRAM p END_PROGRAM", &Options { input_bytes: 3, output_bytes: 0, marker_bytes: 9, ..Options::default() });
+    let odd = Host::with(
+        "PROGRAM p END_PROGRAM",
+        &Options { input_bytes: 3, output_bytes: 0, marker_bytes: 9, ..Options::default() },
+    );
     let l = odd.artifact.map.layout;
     assert_eq!((l.output.offset, l.marker.offset, l.retain.offset), (264, 264, 280));
 }
@@ -61,8 +66,13 @@ fn accesses_to_the_image() {
          PROGRAM p VAR i AT %IW4 : INT; m AT %MW0 : ARRAY [0..9] OF INT; n : INT; END_VAR q := i > m[n]; %MB50 := 3; m[2] := 1; END_PROGRAM",
     );
     let map = &h.artifact.map;
-    let show = |list: &[dinrail_iec::artifact::Access]| -> Vec<(AreaKind, u32, u32, Option<u8>)> { list.iter().map(|a| (a.area, a.byte, a.bytes, a.bit)).collect() };
-    assert_eq!(show(&map.writes), [(AreaKind::Output, 1, 1, Some(3)), (AreaKind::Marker, 50, 1, None), (AreaKind::Marker, 4, 2, None)]);
+    let show = |list: &[dinrail_iec::artifact::Access]| -> Vec<(AreaKind, u32, u32, Option<u8>)> {
+        list.iter().map(|a| (a.area, a.byte, a.bytes, a.bit)).collect()
+    };
+    assert_eq!(
+        show(&map.writes),
+        [(AreaKind::Output, 1, 1, Some(3)), (AreaKind::Marker, 50, 1, None), (AreaKind::Marker, 4, 2, None)]
+    );
     assert_eq!(show(&map.reads), [(AreaKind::Input, 8, 2, None), (AreaKind::Marker, 0, 20, None)]);
     assert_eq!((map.layout.used_input, map.layout.used_output, map.layout.used_marker), (10, 10, 51));
     assert!(map.writes.iter().all(|w| map.place_text(w.statement).starts_with("test.st:2:")));
@@ -77,11 +87,18 @@ fn symbols_of_the_stack_file_are_globals() {
         origin: "stack.toml:12".to_owned(),
     };
     let options = Options {
-        externals: vec![external("Buttons", "%IB0", "BYTE"), external("Lamp", "%QX0.1", "BOOL"), external("Spare", "%QW7", "INT")],
+        externals: vec![
+            external("Buttons", "%IB0", "BYTE"),
+            external("Lamp", "%QX0.1", "BOOL"),
+            external("Spare", "%QW7", "INT"),
+        ],
         implicit_cycle_ns: Some(1_000_000),
         ..Options::default()
     };
-    let mut h = Host::with("PROGRAM p VAR_EXTERNAL buttons : BYTE; END_VAR lamp := buttons = 16#05; END_PROGRAM", &options);
+    let mut h = Host::with(
+        "PROGRAM p VAR_EXTERNAL buttons : BYTE; END_VAR lamp := buttons = 16#05; END_PROGRAM",
+        &options,
+    );
     h.set("Buttons", Value::Int(5));
     h.run();
     assert_eq!(h.int("lamp"), 1);
@@ -89,7 +106,8 @@ fn symbols_of_the_stack_file_are_globals() {
     assert_eq!((s.kind, s.storage, s.area), (VarKind::Mapped, Storage::Bit(1), AreaKind::Output));
     assert_eq!(h.artifact.map.layout.used_output, 16);
     assert_eq!(h.artifact.map.tasks[0].interval_ns, Some(1_000_000));
-    let wrong = compile(&source("PROGRAM p VAR_EXTERNAL buttons : INT; END_VAR END_PROGRAM"), &options).unwrap_err();
+    let wrong =
+        compile(&source("PROGRAM p VAR_EXTERNAL buttons : INT; END_VAR END_PROGRAM"), &options).unwrap_err();
     assert!(wrong.render(false).contains("stack.toml:12"));
 }
 
@@ -102,7 +120,13 @@ fn tasks_of_a_configuration() {
            PROGRAM a1 WITH fast : a; PROGRAM b1 WITH once : b; PROGRAM a2 WITH fast : a; PROGRAM loose : b; PROGRAM z WITH idle : b;
          END_RESOURCE END_CONFIGURATION",
     );
-    let t: Vec<_> = h.artifact.map.tasks.iter().map(|t| (t.name.as_str(), t.priority, t.interval_ns, t.single.as_deref(), t.programs.join(","))).collect();
+    let t: Vec<_> = h
+        .artifact
+        .map
+        .tasks
+        .iter()
+        .map(|t| (t.name.as_str(), t.priority, t.interval_ns, t.single.as_deref(), t.programs.join(",")))
+        .collect();
     assert_eq!(
         t,
         [
@@ -112,10 +136,17 @@ fn tasks_of_a_configuration() {
             ("main", 65_535, None, None, "loose".to_owned()),
         ]
     );
-    assert!(h.artifact.map.symbol("a1.x").is_some() && h.artifact.map.symbol("a2.x").is_some() && h.artifact.map.symbol("k").is_some());
+    assert!(
+        h.artifact.map.symbol("a1.x").is_some()
+            && h.artifact.map.symbol("a2.x").is_some()
+            && h.artifact.map.symbol("k").is_some()
+    );
     let plain = Host::new("PROGRAM Alpha END_PROGRAM PROGRAM beta END_PROGRAM");
     let task = &plain.artifact.map.tasks[0];
-    assert_eq!((task.name.as_str(), task.interval_ns, task.programs.join(",")), ("main", None, "Alpha,beta".to_owned()));
+    assert_eq!(
+        (task.name.as_str(), task.interval_ns, task.programs.join(",")),
+        ("main", None, "Alpha,beta".to_owned())
+    );
     assert!(plain.artifact.map.call_depth >= 2);
 }
 
@@ -158,7 +189,11 @@ fn lines_of_functions_match_what_the_engine_reports() {
 fn artefacts_come_back_from_their_bytes() {
     let a = compile(&source(SAMPLE), &Options::default()).unwrap().artifact;
     assert_eq!(Artifact::from_wasm(&a.wasm).unwrap(), a);
-    assert_eq!(a.hash(), compile(&source(SAMPLE), &Options::default()).unwrap().artifact.hash(), "the same sources give the same bytes");
+    assert_eq!(
+        a.hash(),
+        compile(&source(SAMPLE), &Options::default()).unwrap().artifact.hash(),
+        "the same sources give the same bytes"
+    );
     assert!(matches!(Artifact::from_wasm(b"hello"), Err(ArtifactError::NotWasm)));
     assert!(matches!(Artifact::from_wasm(b"\0asm\x01\0\0\0"), Err(ArtifactError::NoMap)));
     for cut in 0..a.wasm.len() {
@@ -181,4 +216,16 @@ proptest::proptest! {
         framed.extend(&bytes);
         let _ = Artifact::from_wasm(&framed);
     }
+}
+
+/// A bound that comes by way of VAR_EXTERNAL is known when the array is declared, in every kind of POU.
+#[test]
+fn constants_by_way_of_var_external() {
+    let h = Host::new(
+        "VAR_GLOBAL CONSTANT n : INT := 3; m : INT := n * 2; END_VAR
+         FUNCTION_BLOCK f VAR_EXTERNAL n : INT; END_VAR VAR a : ARRAY [1..n] OF INT; END_VAR a[n] := 1; END_FUNCTION_BLOCK
+         PROGRAM p VAR_EXTERNAL CONSTANT m : INT; END_VAR VAR CONSTANT k : INT := m + 1; END_VAR VAR b : ARRAY [0..k] OF INT; x : f; END_VAR x(); b[m] := 2; END_PROGRAM",
+    );
+    assert_eq!(h.artifact.map.symbol("p.b").unwrap().dims, [(0, 7)]);
+    assert_eq!(h.artifact.map.symbol("p.x.a").unwrap().dims, [(1, 3)]);
 }

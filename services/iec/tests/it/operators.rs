@@ -80,7 +80,14 @@ fn integers() {
                 if signed {
                     expected.extend([("neg", w(-a)), ("abs1", w(a.abs()))]);
                 }
-                for (prefix, v) in [("eq", a == b), ("ne", a != b), ("lt", a < b), ("le", a <= b), ("gt", a > b), ("ge", a >= b)] {
+                for (prefix, v) in [
+                    ("eq", a == b),
+                    ("ne", a != b),
+                    ("lt", a < b),
+                    ("le", a <= b),
+                    ("gt", a > b),
+                    ("ge", a >= b),
+                ] {
                     assert_eq!(h.int(prefix), i128::from(v), "{ty} {a} {prefix} {b}");
                     assert_eq!(h.int(&format!("f{prefix}")), i128::from(v), "{ty} {a} {prefix} {b}");
                 }
@@ -96,18 +103,25 @@ fn integers() {
 #[test]
 fn division_by_zero_faults_with_the_dividend() {
     for (ty, ..) in INTS {
-        let mut h = Host::new(&format!("PROGRAM p VAR a : {ty} := 7; b, c : {ty}; END_VAR\n  c := a / b;\nEND_PROGRAM"));
+        let mut h = Host::new(&format!(
+            "PROGRAM p VAR a : {ty} := 7; b, c : {ty}; END_VAR\n  c := a / b;\nEND_PROGRAM"
+        ));
         let f = h.scan_at(0).unwrap_err();
         assert_eq!((f.id, f.place.as_str(), f.value), (TrapId::DivisionByZero, "test.st:2:3", 7), "{ty}");
         let options = Options { mod_by_zero: ModByZero::Fault, ..Options::default() };
-        let mut h = Host::with(&format!("PROGRAM p VAR a : {ty} := 7; b, c : {ty}; END_VAR c := a MOD b; END_PROGRAM"), &options);
+        let mut h = Host::with(
+            &format!("PROGRAM p VAR a : {ty} := 7; b, c : {ty}; END_VAR c := a MOD b; END_PROGRAM"),
+            &options,
+        );
         assert_eq!(h.scan_at(0).unwrap_err().id, TrapId::ModuloByZero);
     }
 }
 
 #[test]
 fn modulo_by_zero_counts_a_warning() {
-    let mut h = Host::new("PROGRAM p VAR a : INT := 7; b, c : INT := 3; END_VAR b := 0; c := a MOD b; c := c + a MOD b; END_PROGRAM");
+    let mut h = Host::new(
+        "PROGRAM p VAR a : INT := 7; b, c : INT := 3; END_VAR b := 0; c := a MOD b; c := c + a MOD b; END_PROGRAM",
+    );
     h.run();
     assert_eq!((h.int("c"), h.u32(sys::WARNINGS)), (0, 2));
 }
@@ -177,7 +191,21 @@ fn reals() {
              eq := a = b; lt := a < b; ge := a >= b; ne := a <> b; END_PROGRAM"
         )
     };
-    let values = [0.0, -0.0, 1.0, -1.0, 0.1, 2.5, -3.75, 1e10, -1e-10, f64::INFINITY, f64::NEG_INFINITY, f64::NAN, 1e38];
+    let values = [
+        0.0,
+        -0.0,
+        1.0,
+        -1.0,
+        0.1,
+        2.5,
+        -3.75,
+        1e10,
+        -1e-10,
+        f64::INFINITY,
+        f64::NEG_INFINITY,
+        f64::NAN,
+        1e38,
+    ];
     let same = |x: f64, y: f64| x == y || (x.is_nan() && y.is_nan());
     let (mut h32, mut h64) = (Host::new(&body("REAL")), Host::new(&body("LREAL")));
     for a in values {
@@ -188,13 +216,39 @@ fn reals() {
                 h.run();
             }
             let (x, y) = (a as f32, b as f32);
-            let narrow = [("add1", x + y), ("sub1", x - y), ("mul1", x * y), ("div1", x / y), ("neg", -x), ("abs1", x.abs()), ("sqrt1", x.sqrt()),
-                ("pow1", libm::powf(x, y)), ("sin1", libm::sinf(x)), ("exp1", libm::expf(x)), ("ln1", libm::logf(x))];
+            let narrow = [
+                ("add1", x + y),
+                ("sub1", x - y),
+                ("mul1", x * y),
+                ("div1", x / y),
+                ("neg", -x),
+                ("abs1", x.abs()),
+                ("sqrt1", x.sqrt()),
+                ("pow1", libm::powf(x, y)),
+                ("sin1", libm::sinf(x)),
+                ("exp1", libm::expf(x)),
+                ("ln1", libm::logf(x)),
+            ];
             for (var, v) in narrow {
-                assert!(same(h32.real(var), f64::from(v)), "REAL {var} of {x} and {y}: {} for {v}", h32.real(var));
+                assert!(
+                    same(h32.real(var), f64::from(v)),
+                    "REAL {var} of {x} and {y}: {} for {v}",
+                    h32.real(var)
+                );
             }
-            let wide = [("add1", a + b), ("sub1", a - b), ("mul1", a * b), ("div1", a / b), ("neg", -a), ("abs1", a.abs()), ("sqrt1", a.sqrt()),
-                ("pow1", libm::pow(a, b)), ("sin1", libm::sin(a)), ("exp1", libm::exp(a)), ("ln1", libm::log(a))];
+            let wide = [
+                ("add1", a + b),
+                ("sub1", a - b),
+                ("mul1", a * b),
+                ("div1", a / b),
+                ("neg", -a),
+                ("abs1", a.abs()),
+                ("sqrt1", a.sqrt()),
+                ("pow1", libm::pow(a, b)),
+                ("sin1", libm::sin(a)),
+                ("exp1", libm::exp(a)),
+                ("ln1", libm::log(a)),
+            ];
             for (var, v) in wide {
                 assert!(same(h64.real(var), v), "LREAL {var} of {a} and {b}: {} for {v}", h64.real(var));
             }
@@ -218,8 +272,13 @@ fn conversions_among_integers_and_bit_strings_keep_the_low_bits() {
     let types = integer_like();
     for (from, fbits, fsigned) in &types {
         let vars: Vec<String> = types.iter().map(|(t, ..)| format!("v_{t}, u_{t} : {t};")).collect();
-        let body: Vec<String> = types.iter().map(|(t, ..)| format!("v_{t} := {from}_TO_{t}(x); u_{t} := TO_{t}(x);")).collect();
-        let mut h = Host::new(&format!("PROGRAM p VAR x : {from}; {} END_VAR {} END_PROGRAM", vars.join(" "), body.join(" ")));
+        let body: Vec<String> =
+            types.iter().map(|(t, ..)| format!("v_{t} := {from}_TO_{t}(x); u_{t} := TO_{t}(x);")).collect();
+        let mut h = Host::new(&format!(
+            "PROGRAM p VAR x : {from}; {} END_VAR {} END_PROGRAM",
+            vars.join(" "),
+            body.join(" ")
+        ));
         for x in edges((*fbits).max(2), *fsigned).into_iter().map(|v| wrap(v, *fbits, *fsigned)) {
             h.set("x", Value::Int(x));
             h.run();
@@ -260,10 +319,47 @@ fn reals_to_integers_round_half_to_even_and_fault_outside() {
                 "PROGRAM p VAR x : {real}; r, t : {ty}; END_VAR r := {real}_TO_{ty}(x); t := {real}_TRUNC_{ty}(x); END_PROGRAM"
             );
             let mut strict = Host::new(&text);
-            let mut clamp = Host::with(&text, &Options { real_to_int: RealToInt::Clamp, ..Options::default() });
-            let (lo, hi) = if signed { (-(1_i128 << (bits - 1)), (1_i128 << (bits - 1)) - 1) } else { (0, (1_i128 << bits) - 1) };
-            let mut values: Vec<f64> = vec![0.0, 0.5, 1.5, 2.5, 2.4, 3.7, -0.5, -1.5, 100.5, 126.5, 127.4, 127.5, 128.0, 255.5, 1e6, 3e9, -3e9, 1e19, 2e19, -1e19, 1e300, f64::NAN, f64::INFINITY, f64::NEG_INFINITY];
-            values.extend([lo as f64, hi as f64, lo as f64 - 1.0, hi as f64 + 1.0, lo as f64 - 0.5, hi as f64 + 0.5]);
+            let mut clamp =
+                Host::with(&text, &Options { real_to_int: RealToInt::Clamp, ..Options::default() });
+            let (lo, hi) = if signed {
+                (-(1_i128 << (bits - 1)), (1_i128 << (bits - 1)) - 1)
+            } else {
+                (0, (1_i128 << bits) - 1)
+            };
+            let mut values: Vec<f64> = vec![
+                0.0,
+                0.5,
+                1.5,
+                2.5,
+                2.4,
+                3.7,
+                -0.5,
+                -1.5,
+                100.5,
+                126.5,
+                127.4,
+                127.5,
+                128.0,
+                255.5,
+                1e6,
+                3e9,
+                -3e9,
+                1e19,
+                2e19,
+                -1e19,
+                1e300,
+                f64::NAN,
+                f64::INFINITY,
+                f64::NEG_INFINITY,
+            ];
+            values.extend([
+                lo as f64,
+                hi as f64,
+                lo as f64 - 1.0,
+                hi as f64 + 1.0,
+                lo as f64 - 0.5,
+                hi as f64 + 0.5,
+            ]);
             for x in values {
                 let x = if real == "REAL" { f64::from(x as f32) } else { x };
                 let rounded = x.round_ties_even();
@@ -278,11 +374,20 @@ fn reals_to_integers_round_half_to_even_and_fault_outside() {
                     let f = result.unwrap_err();
                     assert_eq!(f.id, TrapId::ConversionOutOfRange);
                     // The record holds the rounded or cut value, one of the two that did not fit.
-                    assert!(f.real == rounded || f.real == x.trunc() || f.real.is_nan(), "{real}_TO_{ty}({x}): {f:?}");
+                    assert!(
+                        f.real == rounded || f.real == x.trunc() || f.real.is_nan(),
+                        "{real}_TO_{ty}({x}): {f:?}"
+                    );
                 }
                 clamp.set("x", Value::Real(x));
                 clamp.run();
-                let expected = if x.is_nan() { 0 } else if rounded >= hi as f64 { hi } else { (rounded as i128).clamp(lo, hi) };
+                let expected = if x.is_nan() {
+                    0
+                } else if rounded >= hi as f64 {
+                    hi
+                } else {
+                    (rounded as i128).clamp(lo, hi)
+                };
                 assert_eq!(clamp.int("r"), expected, "clamped {real}_TO_{ty}({x})");
             }
         }
@@ -318,9 +423,28 @@ fn time_arithmetic_and_conversions() {
     h.run();
     let (a, b) = (60_000 * ms, 1500 * ms);
     for (var, v) in [
-        ("add1", a + b), ("sub1", b - a), ("mul1", b * 3), ("mul2", b * 2), ("div1", a / 3), ("mulr", b / 2), ("divl", 1000 * ms), ("neg", -b),
-        ("f_add", a + b), ("f_mul", b * 2), ("f_div", b / 2), ("min1", b), ("d", 1500), ("s", wrap(1500, 8, true)), ("w", 1500), ("u", 60_000),
-        ("c1", 250 * ms), ("c2", 2_500_000), ("c3", 1), ("c4", 60_000 * ms), ("lt", 1), ("z", 0),
+        ("add1", a + b),
+        ("sub1", b - a),
+        ("mul1", b * 3),
+        ("mul2", b * 2),
+        ("div1", a / 3),
+        ("mulr", b / 2),
+        ("divl", 1000 * ms),
+        ("neg", -b),
+        ("f_add", a + b),
+        ("f_mul", b * 2),
+        ("f_div", b / 2),
+        ("min1", b),
+        ("d", 1500),
+        ("s", wrap(1500, 8, true)),
+        ("w", 1500),
+        ("u", 60_000),
+        ("c1", 250 * ms),
+        ("c2", 2_500_000),
+        ("c3", 1),
+        ("c4", 60_000 * ms),
+        ("lt", 1),
+        ("z", 0),
     ] {
         assert_eq!(h.int(var), v, "{var}");
     }
@@ -353,7 +477,8 @@ fn implicit_widening() {
             let text = format!("PROGRAM p VAR a : {from}; b : {to}; END_VAR b := a; END_PROGRAM");
             let allowed = from == to || wider.contains(to);
             assert_eq!(compile(&source(&text), &Options::default()).is_ok(), allowed, "{from} to {to}");
-            let convert = format!("PROGRAM p VAR a : {from}; b : {to}; END_VAR b := {from}_TO_{to}(a); END_PROGRAM");
+            let convert =
+                format!("PROGRAM p VAR a : {from}; b : {to}; END_VAR b := {from}_TO_{to}(a); END_PROGRAM");
             assert!(compile(&source(&convert), &Options::default()).is_ok(), "{from}_TO_{to}");
         }
     }
@@ -368,7 +493,9 @@ fn mixed_operands_widen_first() {
          i1 := s + u; d1 := s + w; l1 := d + ud; b1 := d < ud; b2 := s < u; l := d + r; wd := wd OR oct; w2 := 16#00FF AND w2; END_PROGRAM",
     );
     h.run();
-    for (var, v) in [("i1", 100), ("d1", 65435), ("l1", 3_999_999_999), ("b1", 1), ("b2", 1), ("wd", 0xff0f), ("w2", 0)] {
+    for (var, v) in
+        [("i1", 100), ("d1", 65435), ("l1", 3_999_999_999), ("b1", 1), ("b2", 1), ("wd", 0xff0f), ("w2", 0)]
+    {
         assert_eq!(h.int(var), v, "{var}");
     }
     assert_eq!(h.real("l"), -0.5);
@@ -382,7 +509,10 @@ fn literals_take_the_type_of_their_context() {
          l := 1.0 / 3; d := i + 100000; x := s < 0; y := u > 5; z := 3 > 2; b := b OR 2#1111; l2 := i * 0.1; w := NOT 16#FF; d2 := 2 ** 10; r2 := 0.1; END_PROGRAM",
     );
     h.run();
-    assert_eq!((h.int("s"), h.int("u"), h.int("b"), h.int("d"), h.int("w")), (-128, i128::from(u64::MAX), 0xff, 100_005, 0xff00));
+    assert_eq!(
+        (h.int("s"), h.int("u"), h.int("b"), h.int("d"), h.int("w")),
+        (-128, i128::from(u64::MAX), 0xff, 100_005, 0xff00)
+    );
     assert_eq!((h.int("x"), h.int("y"), h.int("z"), h.int("d2")), (1, 1, 1, 1024));
     assert_eq!(h.real("r"), 1.0);
     assert_eq!(h.real("l"), 1.0 / 3.0);
@@ -404,7 +534,9 @@ fn short_circuit_forms_skip_the_right_side() {
 
 #[test]
 fn mux_picks_and_faults() {
-    let mut h = Host::new("PROGRAM p VAR k : INT; v, c : DINT; END_VAR v := MUX(k, 10, 20, 30); c := MUX(1, 10, 20); END_PROGRAM");
+    let mut h = Host::new(
+        "PROGRAM p VAR k : INT; v, c : DINT; END_VAR v := MUX(k, 10, 20, 30); c := MUX(1, 10, 20); END_PROGRAM",
+    );
     for (k, v) in [(0, 10), (1, 20), (2, 30)] {
         h.set("k", Value::Int(k));
         h.run();
@@ -420,7 +552,13 @@ fn mux_picks_and_faults() {
 
 #[test]
 fn elem_types_have_the_bytes_of_the_contract() {
-    let all = [("BOOL", ElemType::Bool), ("WORD", ElemType::Word), ("REAL", ElemType::Real), ("LREAL", ElemType::Lreal), ("TIME", ElemType::Time)];
+    let all = [
+        ("BOOL", ElemType::Bool),
+        ("WORD", ElemType::Word),
+        ("REAL", ElemType::Real),
+        ("LREAL", ElemType::Lreal),
+        ("TIME", ElemType::Time),
+    ];
     for (name, elem) in all {
         let h = Host::new(&format!("PROGRAM p VAR x : {name}; END_VAR END_PROGRAM"));
         assert_eq!(h.artifact.map.symbol("p.x").unwrap().elem, elem);

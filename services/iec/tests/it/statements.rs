@@ -37,7 +37,10 @@ fn case_takes_lists_ranges_and_the_first_match() {
             assert_eq!(h.int("r"), expected, "{ty} {x}");
         }
     }
-    check("PROGRAM p VAR x : INT := -3; r : INT := 7; END_VAR CASE x OF -5..-1: r := 1; END_CASE; CASE x OF 1: r := 9; END_CASE; END_PROGRAM", &[("r", 1)]);
+    check(
+        "PROGRAM p VAR x : INT := -3; r : INT := 7; END_VAR CASE x OF -5..-1: r := 1; END_CASE; CASE x OF 1: r := 9; END_CASE; END_PROGRAM",
+        &[("r", 1)],
+    );
 }
 
 #[test]
@@ -68,15 +71,22 @@ fn end_and_step_of_for_are_evaluated_once() {
         "PROGRAM p VAR i, n, e, s : INT; END_VAR e := 5; s := 1; FOR i := 1 TO e BY s DO e := 100; s := 7; n := n + 1; END_FOR; END_PROGRAM",
         &[("n", 5)],
     );
-    let mut h = Host::new("PROGRAM p VAR i, s : INT; END_VAR\nFOR i := 1 TO 3 BY s DO ; END_FOR;\nEND_PROGRAM");
+    let mut h =
+        Host::new("PROGRAM p VAR i, s : INT; END_VAR\nFOR i := 1 TO 3 BY s DO ; END_FOR;\nEND_PROGRAM");
     let f = h.scan_at(0).unwrap_err();
     assert_eq!((f.id, f.place.as_str()), (TrapId::ForStepZero, "test.st:2:1"));
 }
 
 #[test]
 fn a_loop_that_changes_its_variable_follows_the_change() {
-    check("PROGRAM p VAR i, n : INT; END_VAR FOR i := 1 TO 10 DO n := n + 1; i := i + 1; END_FOR; END_PROGRAM", &[("n", 5)]);
-    check("PROGRAM p VAR i, n : INT; END_VAR FOR i := 1 TO 10 DO n := n + 1; i := 50; END_FOR; END_PROGRAM", &[("n", 1), ("i", 50)]);
+    check(
+        "PROGRAM p VAR i, n : INT; END_VAR FOR i := 1 TO 10 DO n := n + 1; i := i + 1; END_FOR; END_PROGRAM",
+        &[("n", 5)],
+    );
+    check(
+        "PROGRAM p VAR i, n : INT; END_VAR FOR i := 1 TO 10 DO n := n + 1; i := 50; END_FOR; END_PROGRAM",
+        &[("n", 1), ("i", 50)],
+    );
     check(
         "FUNCTION bump : BOOL VAR_IN_OUT x : INT; END_VAR x := x + 4; bump := TRUE; END_FUNCTION
          PROGRAM p VAR i, n : INT; b : BOOL; END_VAR FOR i := 0 TO 9 DO b := bump(i); n := n + 1; END_FOR; END_PROGRAM",
@@ -133,7 +143,15 @@ fn function_blocks_keep_their_state_per_instance() {
     h.run();
     h.run();
     for (var, v) in [
-        ("x.sum", 44), ("d", 44), ("y.sum", 22), ("g.n", 3000), ("arr[1].n", 2), ("arr[2].n", 4), ("arr[3].n", 6), ("e", 4), ("x.a.first", 0),
+        ("x.sum", 44),
+        ("d", 44),
+        ("y.sum", 22),
+        ("g.n", 3000),
+        ("arr[1].n", 2),
+        ("arr[2].n", 4),
+        ("arr[3].n", 6),
+        ("e", 4),
+        ("x.a.first", 0),
         ("x.b.step", 10),
     ] {
         assert_eq!(h.int(var), v, "{var}");
@@ -171,12 +189,24 @@ fn arrays_structures_and_enumerations() {
 
 #[test]
 fn array_bounds_are_checked_in_every_dimension_and_type() {
-    for (ty, lo, hi) in [("SINT", -5, 5), ("INT", 0, 9), ("DINT", -1, 1), ("LINT", 1, 3), ("USINT", 0, 9), ("UDINT", -3, 9), ("ULINT", -3, 9), ("UINT", 2, 300)] {
-        let text = format!("PROGRAM p VAR i : {ty}; a : ARRAY [{lo}..{hi}] OF INT; r : INT; END_VAR\n  a[i] := 5; r := a[i];\nEND_PROGRAM");
+    for (ty, lo, hi) in [
+        ("SINT", -5, 5),
+        ("INT", 0, 9),
+        ("DINT", -1, 1),
+        ("LINT", 1, 3),
+        ("USINT", 0, 9),
+        ("UDINT", -3, 9),
+        ("ULINT", -3, 9),
+        ("UINT", 2, 300),
+    ] {
+        let text = format!(
+            "PROGRAM p VAR i : {ty}; a : ARRAY [{lo}..{hi}] OF INT; r : INT; END_VAR\n  a[i] := 5; r := a[i];\nEND_PROGRAM"
+        );
         let mut h = Host::new(&text);
         let signed = !ty.starts_with('U');
         for i in [lo - 1, lo, 2.max(lo), hi, hi + 1, 0, 100, 127] {
-            if (i < 0 && !signed) || (ty == "USINT" && i > 255) || (ty == "SINT" && !(-128..128).contains(&i)) {
+            if (i < 0 && !signed) || (ty == "USINT" && i > 255) || (ty == "SINT" && !(-128..128).contains(&i))
+            {
                 continue;
             }
             h.set("i", Value::Int(i.into()));
@@ -185,7 +215,11 @@ fn array_bounds_are_checked_in_every_dimension_and_type() {
                 assert_eq!((result, h.int("r")), (Ok(()), 5), "{ty} {i}");
             } else {
                 let f = result.unwrap_err();
-                assert_eq!((f.id, f.value, f.place.as_str()), (TrapId::IndexOutOfBounds, i64::from(i), "test.st:2:3"), "{ty} {i}");
+                assert_eq!(
+                    (f.id, f.value, f.place.as_str()),
+                    (TrapId::IndexOutOfBounds, i64::from(i), "test.st:2:3"),
+                    "{ty} {i}"
+                );
             }
         }
         if !signed {
@@ -196,7 +230,9 @@ fn array_bounds_are_checked_in_every_dimension_and_type() {
             }
         }
     }
-    let mut h = Host::new("PROGRAM p VAR i, j : INT; a : ARRAY [0..2, 0..3] OF INT; END_VAR a[i, j] := 1; END_PROGRAM");
+    let mut h = Host::new(
+        "PROGRAM p VAR i, j : INT; a : ARRAY [0..2, 0..3] OF INT; END_VAR a[i, j] := 1; END_PROGRAM",
+    );
     h.set("j", Value::Int(4));
     assert_eq!(h.scan_at(0).unwrap_err().value, 4);
 }
@@ -214,14 +250,18 @@ fn indices_known_to_be_in_bounds() {
         &[("a[0]", 80), ("a[2]", 62), ("a[8]", 8), ("b[10]", 90), ("t[255]", 2), ("s", 968)],
     );
     // An index that wraps is not proven by the bounds of its type.
-    let mut h = Host::new("PROGRAM p VAR s : SINT := 127; a : ARRAY [-128..127] OF INT; END_VAR a[s + 1] := 5; END_PROGRAM");
+    let mut h = Host::new(
+        "PROGRAM p VAR s : SINT := 127; a : ARRAY [-128..127] OF INT; END_VAR a[s + 1] := 5; END_PROGRAM",
+    );
     h.run();
     assert_eq!(h.int("a[-128]"), 5);
 }
 
 #[test]
 fn subranges_are_checked() {
-    let mut h = Host::new("TYPE pct : INT (0..100); END_TYPE PROGRAM p VAR x : pct; y : INT := 50; END_VAR\nx := y;\nEND_PROGRAM");
+    let mut h = Host::new(
+        "TYPE pct : INT (0..100); END_TYPE PROGRAM p VAR x : pct; y : INT := 50; END_VAR\nx := y;\nEND_PROGRAM",
+    );
     h.run();
     h.set("y", Value::Int(101));
     let f = h.scan_at(0).unwrap_err();
@@ -239,7 +279,9 @@ fn located_variables_share_the_image() {
     assert_eq!(h.int("b"), 8, "initial values lie in the image");
     h.set("w", Value::Int(-2));
     h.run();
-    for (var, v) in [("b", 0x81), ("v", 1), ("got", 1), ("words[2]", 500), ("t", 5_000_000_000), ("raw", 5001)] {
+    for (var, v) in
+        [("b", 0x81), ("v", 1), ("got", 1), ("words[2]", 500), ("t", 5_000_000_000), ("raw", 5001)]
+    {
         assert_eq!(h.int(var), v, "{var}");
     }
     let q = h.artifact.map.layout.output.offset;
@@ -269,7 +311,9 @@ fn first_scan_of_the_edge_blocks() {
 
 #[test]
 fn counters_stop_at_the_limits_of_their_type() {
-    let mut h = Host::new("PROGRAM p VAR u : CTU; d : CTD; x : BOOL; END_VAR x := NOT x; u(CU := x, PV := 5); d(CD := x, PV := 5); END_PROGRAM");
+    let mut h = Host::new(
+        "PROGRAM p VAR u : CTU; d : CTD; x : BOOL; END_VAR x := NOT x; u(CU := x, PV := 5); d(CD := x, PV := 5); END_PROGRAM",
+    );
     h.set("u.CV", Value::Int(32766));
     h.set("d.CV", Value::Int(-32767));
     for _ in 0..8 {
@@ -301,7 +345,10 @@ fn debug_builds_call_brk_before_every_statement() {
     h.write(dinrail_iec::artifact::sys::BRK_ANY, &[1]);
     h.run();
     let lines: Vec<String> = h.store.data().clone().iter().map(|s| h.artifact.map.place_text(*s)).collect();
-    assert_eq!(lines, ["test.st:2:1", "test.st:3:1", "test.st:4:3", "test.st:4:3", "test.st:6:1", "test.st:7:3"]);
+    assert_eq!(
+        lines,
+        ["test.st:2:1", "test.st:3:1", "test.st:4:3", "test.st:4:3", "test.st:6:1", "test.st:7:3"]
+    );
     assert!(h.artifact.map.debug);
     let release = compile(&source(text), &Options::default()).unwrap().artifact;
     assert!(!release.map.debug && release.wasm.len() < h.artifact.wasm.len());
@@ -340,6 +387,21 @@ fn speed_of_the_anchors() {
         best = best.min(t.elapsed().as_nanos() / 100);
     }
     println!("1000 IL-like instructions: {best} ns");
+    for anchor in [
+        "PROGRAM bubble VAR a : ARRAY [0..999] OF DINT; i, j, t, swaps : DINT; END_VAR FOR i := 0 TO 999 DO a[i] := 1000 - i; END_FOR;
+         FOR i := 0 TO 998 DO FOR j := 0 TO 998 - i DO IF a[j] > a[j + 1] THEN t := a[j]; a[j] := a[j + 1]; a[j + 1] := t; swaps := swaps + 1; END_IF; END_FOR; END_FOR; END_PROGRAM",
+        "PROGRAM math VAR i, n, acc : DINT; x : REAL := 1.5; y : REAL; END_VAR acc := 0; FOR i := 1 TO 100000 DO y := x * 1.0; acc := acc + REAL_TO_DINT(y - 0.4); n := n + 1; END_FOR; END_PROGRAM",
+    ] {
+        let mut h = Host::new(anchor);
+        let f = h.task("task.main").typed::<(), ()>(&h.store).unwrap();
+        let mut best = std::time::Duration::MAX;
+        for _ in 0..10 {
+            let t = std::time::Instant::now();
+            f.call(&mut h.store, ()).unwrap();
+            best = best.min(t.elapsed());
+        }
+        println!("{}: {best:?}", &anchor[8..14]);
+    }
     let compiled = std::time::Instant::now();
     let _ = compile(&source(SAMPLE), &Options::default()).unwrap();
     println!("compile the sample to wasm: {} us", compiled.elapsed().as_micros());

@@ -167,9 +167,9 @@ fn variables(map: &DebugMap, memory: &[u8], instance: &str, statement: &str) -> 
         let cell = Cell { offset: symbol.offset, elem: symbol.elem, storage: symbol.storage };
         let row = (name.to_owned(), cell.text(memory));
         if mentioned {
-            named.push(row)
+            named.push(row);
         } else if !name.contains('.') {
-            others.push(row)
+            others.push(row);
         }
     }
     named.append(&mut others);

@@ -127,7 +127,7 @@ pub struct Engine {
     initial: Vec<u8>,
     /// %I to the searched part of DATA, as after the last scan.
     prev: Vec<u8>,
-    /// %Q to RETAIN, as before the tasks: what a watchdog kill goes back to.
+    /// %I to RETAIN, as before the tasks: what a watchdog kill goes back to.
     before: Vec<u8>,
     /// %I as the field delivered it.
     field: Vec<u8>,
@@ -169,7 +169,7 @@ impl Engine {
             setup_json: serde_json::to_vec(&*setup).unwrap_or_default(),
             program_hash: program.as_ref().map_or(0, |p| p.artifact.hash()),
             prev: initial[image.input.offset as usize..searched as usize].to_vec(),
-            before: vec![0; (retain.offset + retain.bytes - image.output.offset) as usize],
+            before: vec![0; (retain.offset + retain.bytes - image.input.offset) as usize],
             field: initial[span(image.input)].to_vec(),
             quality: vec![Quality::NoData as u8; setup.inputs.len()],
             forces: Vec::with_capacity(MAX_FORCES),

@@ -69,7 +69,7 @@ impl Engine {
             self.state = PlcState::Fault;
             return;
         }
-        let retain = span(self.retain);
+        let (retain, state_end) = (span(self.retain), self.state_end() as usize);
         let memory = self.body.memory_mut();
         match kind {
             Start::Cold => memory.copy_from_slice(&self.initial),
@@ -77,7 +77,11 @@ impl Engine {
                 memory[..retain.start].copy_from_slice(&self.initial[..retain.start]);
                 memory[retain.end..].copy_from_slice(&self.initial[retain.end..]);
             }
-            Start::Hot => memory[sys::TRAP_ID as usize..sys::TRAP_REAL as usize + 8].fill(0),
+            Start::Hot => {
+                memory[sys::TRAP_ID as usize..sys::TRAP_REAL as usize + 8].fill(0);
+                // Temporaries are no state: what a killed task left there must not matter.
+                memory[state_end..].copy_from_slice(&self.initial[state_end..]);
+            }
         }
         self.schedule.start(self.stamps.plc_time_ns);
         self.fault = None;
@@ -252,7 +256,7 @@ impl Engine {
     fn run_tasks(&mut self, killed: Option<&Fault<'_>>, result: &mut ScanOutcome) {
         let Some(program) = self.program.clone() else { return };
         let map = &program.artifact.map;
-        let keep = self.image.output.offset as usize..(self.retain.offset + self.retain.bytes) as usize;
+        let keep = self.kept_on_kill();
         self.before.copy_from_slice(&self.body.memory()[keep]);
         for place in 0..self.schedule.len() {
             let Some(due) = self.schedule.due(place, self.stamps.plc_time_ns, self.body.memory()) else {
@@ -287,6 +291,11 @@ impl Engine {
         }
     }
 
+    /// %I to RETAIN.
+    fn kept_on_kill(&self) -> std::ops::Range<usize> {
+        self.image.input.offset as usize..(self.retain.offset + self.retain.bytes) as usize
+    }
+
     fn trap(&mut self, raw: &RawTrap, task: usize, program: &Program) {
         let report = FaultReport::new(raw, task, &program.artifact.map, self.body.memory(), &program.sources);
         self.writer.fault(&Fault {
@@ -303,7 +312,7 @@ impl Engine {
         if raw.trap == TrapId::Watchdog as u32 {
             // Nobody knows how far the task came: what the field and RETAIN see goes back to before the
             // tasks, DATA to its initial values.
-            let keep = self.image.output.offset as usize..(self.retain.offset + self.retain.bytes) as usize;
+            let keep = self.kept_on_kill();
             let data = span(self.data);
             let memory = self.body.memory_mut();
             memory[keep].copy_from_slice(&self.before);

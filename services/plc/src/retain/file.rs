@@ -97,7 +97,7 @@ fn copy_loop(fd: &OwnedFd, path: &Path, stop: &AtomicBool, failures: &AtomicU64)
             match write_file(path, &kept) {
                 Ok(()) => written = Some((kept.layout, kept.bytes)),
                 Err(e) => {
-                    if failures.fetch_add(1, Ordering::Relaxed) % 120 == 0 {
+                    if failures.fetch_add(1, Ordering::Relaxed).is_multiple_of(120) {
                         tracing::error!("retain file {} cannot be written: {e}", path.display());
                     }
                 }

@@ -35,7 +35,7 @@ const WRITE_AGE_NS: u64 = 1_000_000_000;
 /// Heartbeat, status and repeats hang on this clock.
 const TICK: Duration = Duration::from_millis(50);
 /// The image is sent again after this time, because a late reader only gets it then.
-const REPEAT_NS: u64 = 90_000_000;
+const REPEAT_NS: u64 = 45_000_000;
 const STATUS_NS: u64 = 1_000_000_000;
 const KEYFRAME_NS: u64 = 10_000_000_000;
 /// An automatic start follows a fault after this time at the earliest.
@@ -210,7 +210,7 @@ impl Live {
         match std::fs::write(&path, &program.artifact.wasm) {
             Ok(()) => detail["artifact"] = json!(path),
             Err(e) => {
-                tracing::warn!("the program cannot be left for the recorder in {}: {e}", path.display())
+                tracing::warn!("the program cannot be left for the recorder in {}: {e}", path.display());
             }
         }
         let tasks: Vec<&str> = program.artifact.map.tasks.iter().map(|t| t.name.as_str()).collect();
@@ -237,6 +237,8 @@ impl Live {
         let mut due_ns = clock::mono_ns();
         reactor.set_alarm(alarm, due_ns).map_err(system("the scan clock"))?;
         self.tick(ctx);
+        // Before the first scan, or a recording could not verify it.
+        self.send_keyframe();
         loop {
             let woken = reactor.wait(None).map_err(system("waiting"))?;
             let (mut rang, mut ticked) = (false, false);

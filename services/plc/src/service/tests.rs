@@ -68,16 +68,51 @@ fn mistakes_are_found_without_starting() {
     let table = [
         (json!({ "trigger": "inputs", "cycle": "10ms" }), GOOD, vec![], "plc.cycle: cycle and trigger"),
         (json!({ "cycle": "50us", "route": [] }), GOOD, vec![], "plc.cycle: a cycle of 50us is not possible"),
-        (json!({ "min_interval": "1s" }), GOOD, vec![], "plc.min_interval: min_interval 1s and max_interval 100ms"),
-        (json!({ "max_interval": "5s" }), GOOD, vec![], "plc.max_interval: max_interval 5s is longer than 1s"),
-        (json!({ "input_timeout": "50ms" }), GOOD, vec![], "plc.input_timeout: input_timeout 50ms is shorter"),
+        (
+            json!({ "min_interval": "1s" }),
+            GOOD,
+            vec![],
+            "plc.min_interval: min_interval 1s and max_interval 100ms",
+        ),
+        (
+            json!({ "max_interval": "5s" }),
+            GOOD,
+            vec![],
+            "plc.max_interval: max_interval 5s is longer than 1s",
+        ),
+        (
+            json!({ "input_timeout": "50ms" }),
+            GOOD,
+            vec![],
+            "plc.input_timeout: input_timeout 50ms is shorter",
+        ),
         (json!({ "watchdog": "1us" }), GOOD, vec![], "plc.watchdog: a watchdog of 1us is not possible"),
-        (json!({ "input_bytes": "1MiB" }), GOOD, vec![], "plc.input_bytes: input_bytes = 1MiB is not possible"),
-        (json!({ "route": [{ "from": "%IW0", "to": "%IW2" }] }), GOOD, vec![], "plc.route[0]: '%IW2' lies in %I"),
+        (
+            json!({ "input_bytes": "1MiB" }),
+            GOOD,
+            vec![],
+            "plc.input_bytes: input_bytes = 1MiB is not possible",
+        ),
+        (
+            json!({ "route": [{ "from": "%IW0", "to": "%IW2" }] }),
+            GOOD,
+            vec![],
+            "plc.route[0]: '%IW2' lies in %I",
+        ),
         (json!({}), GOOD, vec![], "plc.: neither program nor route"),
         (program.clone(), GOOD, vec![], "plc.program: the program does not compile:\nerror["),
-        (program.clone(), GOOD, vec![range(Area::Input, 3, 2, Some("Level"))], "io.in[0].to: symbol 'Level': byte 3"),
-        (json!({ "input_bytes": 8 }), GOOD, vec![range(Area::Input, 7, 2, None)], "io.in[0].to: 'id 123h at byte 7' ends at byte 9"),
+        (
+            program.clone(),
+            GOOD,
+            vec![range(Area::Input, 3, 2, Some("Level"))],
+            "io.in[0].to: symbol 'Level': byte 3",
+        ),
+        (
+            json!({ "input_bytes": 8 }),
+            GOOD,
+            vec![range(Area::Input, 7, 2, None)],
+            "io.in[0].to: 'id 123h at byte 7' ends at byte 9",
+        ),
         (
             program.clone(),
             "PROGRAM main VAR i AT %IB9 : USINT; END_VAR i := 1; END_PROGRAM",
@@ -93,14 +128,18 @@ fn mistakes_are_found_without_starting() {
     ];
     for (config, text, ranges, expected) in table {
         let findings = found(config.clone(), text, ranges);
-        assert!(findings.iter().any(|f| f.starts_with(expected)), "{config}: expected {expected:?} in {findings:#?}");
+        assert!(
+            findings.iter().any(|f| f.starts_with(expected)),
+            "{config}: expected {expected:?} in {findings:#?}"
+        );
     }
 }
 
 #[test]
 fn what_it_needs_of_the_rail() {
     let neighbours = Neighbours { name: "plc".into(), ..Neighbours::default() };
-    let config: Config = serde_json::from_value(json!({ "program": ["a.st"], "marker_bytes": "64KiB" })).unwrap();
+    let config: Config =
+        serde_json::from_value(json!({ "program": ["a.st"], "marker_bytes": "64KiB" })).unwrap();
     let wiring = topics(&config, &neighbours);
     let kinds: Vec<&str> = wiring.topics.iter().map(|t| t.kind.row().suffix).collect();
     assert_eq!(kinds, ["image", "writes", "scan", "keyframe", "jobs", "results"]);
@@ -123,5 +162,39 @@ fn the_watchdog_follows_the_fastest_task_within_limits() {
         [(None, 100), (Some(1_000_000), 100), (Some(50_000_000), 500), (Some(1_000_000_000), 1000)]
     {
         assert_eq!(watchdog_limit(&config, shortest_ns), Duration::from_millis(expected_ms));
+    }
+}
+
+mod any_job {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn engine() -> Engine {
+        let setup = Setup { cycle_ns: Some(10_000_000), ..Setup::default() };
+        let text = "PROGRAM main VAR a : ARRAY [-3..3, 1..2] OF INT; t : TIME; b AT %QX0.1 : BOOL; r : LREAL; END_VAR ; END_PROGRAM";
+        let sources = vec![dinrail_iec::Source { name: "a.st".into(), text: text.into() }];
+        let program = program::compile_sources(sources, &setup).unwrap().program;
+        Engine::new(&Runtime::new().unwrap(), Some(program), std::sync::Arc::new(setup)).unwrap()
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(64))]
+        #[test]
+        fn is_answered_without_panic(
+            jobs in prop::collection::vec((
+                "(run|stop|force|unforce|read|write|load|x)?",
+                "(main\\.)?(a|t|b|r|%Q[XBWDL]?|é)(\\[?-?[0-9]{0,20},?-?[0-9]{0,3}\\]?)?(\\.[0-9]{0,9})?",
+                prop_oneof![any::<i64>().prop_map(|n| json!(n)), any::<f64>().prop_map(|x| json!(x)),
+                            "\\PC{0,12}".prop_map(|s| json!(s)), Just(json!(null)), Just(json!([1])), Just(json!(true))],
+            ), 1..40),
+            bytes in prop::collection::vec(any::<u8>(), 0..60),
+        ) {
+            let engine = engine();
+            prop_assert!(jobs::parse(&bytes, &engine).is_err());
+            for (what, var, value) in jobs {
+                let job = json!({ "do": what, "var": var, "value": value, "path": var });
+                let _ = jobs::parse(&serde_json::to_vec(&job).unwrap(), &engine);
+            }
+        }
     }
 }
