@@ -177,3 +177,23 @@ fn after_kills_the_spans_are_listed_and_99_of_100_scans_verified() {
     assert!(verified as f64 >= 0.99 * total as f64, "{verified} of {total} scans verified");
     assert!(total > 2000, "{total}");
 }
+
+#[test]
+fn every_file_of_a_rotated_recording_verifies_alone() {
+    let port = free_port();
+    let scratch = Scratch::new("rotate");
+    scratch.write("main.st", PROGRAM);
+    scratch.write("conveyor.log", include_str!("../recordings/conveyor.log"));
+    let toml = text(port).replace("dir = \"recordings\"\n", "dir = \"recordings\"\nmax_time = \"2s\"\n");
+    let mut stack = Stack::spawn_in("rotate", &toml, scratch, &[]);
+    stack.wait_ready();
+    stack.wait("three files", || (stack.recordings().len() >= 4).then_some(()));
+    assert_eq!(stack.take_down(), 0, "{}", stack.log());
+    let mut scans = 0;
+    for recording in stack.recordings() {
+        let (code, report, said) = verify(&recording, &[]);
+        assert_eq!(code, 0, "{}: {said}", recording.display());
+        scans += report["scans_verified"].as_u64().unwrap();
+    }
+    assert!(scans > 1000, "{scans}");
+}

@@ -30,6 +30,8 @@ pub enum EventKind {
     Held,
     /// The stack ends because of a service.
     StackFailed,
+    /// /dev/shm is full: what died cannot be cleaned up and started again until there is room.
+    NoRoom,
     /// The stack is being stopped.
     Stopping,
     /// An output owner went to its safe state.

@@ -42,10 +42,12 @@
 //! ```
 //!
 //! Module by module: [`payload`] the messages; [`topic`] the one table of topics; [`wiring`] what a service
-//! declares before it runs; [`stack`] the resolved stack every process reads; [`rail`] joining and creating the
+//! declares before it runs; [`stack`] the resolved stack every process reads; [`plc_table`] what others read of a
+//! plc's keys; [`rail`] joining and creating the
 //! rail; [`port`] publishers and subscribers; [`inbox`] wake-ups; [`reactor`] waiting for descriptors and
 //! clocks; [`context`] what `run` receives; [`image_write`] and [`scan_record`] the two binary codecs;
-//! [`event`] what happened; [`units`] and [`net`] values of the stack file.
+//! [`event`] what happened; [`units`] and [`net`] values of the stack file. With the feature `testing` a module of that
+//! name makes a rail for tests.
 
 pub mod clock;
 pub mod context;
@@ -54,11 +56,14 @@ pub mod image_write;
 pub mod inbox;
 pub mod net;
 pub mod payload;
+pub mod plc_table;
 pub mod port;
 pub mod rail;
 pub mod reactor;
 pub mod scan_record;
 pub mod stack;
+#[cfg(feature = "testing")]
+pub mod testing;
 pub mod topic;
 pub mod units;
 pub mod wiring;

@@ -1,4 +1,4 @@
-//! Network settings that every TCP service of a stack shares: where it listens and who may connect.
+//! What every TCP service of a stack shares: who may connect, and how failing accepts are told.
 
 use serde::{Deserialize, Serialize};
 use std::net::{IpAddr, Ipv4Addr};
@@ -44,9 +44,41 @@ impl IpFilter {
     }
 }
 
+/// Tells a failure that comes again and again at most once per 10 s: an accept without descriptors fails ten times
+/// a second for as long as they lack. Sans-I/O: the time comes in.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Seldom {
+    told_ns: Option<u64>,
+    untold: u64,
+}
+
+impl Seldom {
+    /// Shortest time between two messages.
+    pub const EVERY_NS: u64 = 10_000_000_000;
+
+    /// One more failure. `Some(n)`: tell it now, and that `n` failures since the last message were not told.
+    pub fn failed(&mut self, now_ns: u64) -> Option<u64> {
+        if self.told_ns.is_some_and(|told_ns| now_ns.saturating_sub(told_ns) < Self::EVERY_NS) {
+            self.untold += 1;
+            return None;
+        }
+        self.told_ns = Some(now_ns);
+        Some(std::mem::take(&mut self.untold))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_flood_of_failures_is_told_every_10_s() {
+        let mut seldom = Seldom::default();
+        let told: Vec<_> =
+            (0..=250_u64).filter_map(|n| seldom.failed(n * 100_000_000).map(|untold| (n, untold))).collect();
+        assert_eq!(told, [(0, 0), (100, 99), (200, 99)]);
+        assert_eq!(seldom.failed(60_000_000_000), Some(50));
+    }
 
     #[test]
     fn the_filter_is_range_and_mask() {

@@ -326,16 +326,19 @@ impl<H: Payload> Subscriber<H> {
     }
 }
 
+/// Takes a message of unknown type: stamp, bytes of the header, tail.
+pub type TakeRaw<'a> = dyn FnMut(&Stamp, &[u8], &[u8]) + 'a;
+
 /// A reader that does not know the payload type: the recorder's. Hands over header bytes and tail.
 pub trait RawSubscriber {
     /// Like [`Subscriber::drain`], with the bytes of the header.
-    fn drain_raw(&mut self, max: usize, take: &mut dyn FnMut(&Stamp, &[u8], &[u8])) -> usize;
+    fn drain_raw(&mut self, max: usize, take: &mut TakeRaw<'_>) -> usize;
     /// Its counters.
     fn counters(&self) -> ReadCounters;
 }
 
 impl<H: Payload> RawSubscriber for Subscriber<H> {
-    fn drain_raw(&mut self, max: usize, take: &mut dyn FnMut(&Stamp, &[u8], &[u8])) -> usize {
+    fn drain_raw(&mut self, max: usize, take: &mut TakeRaw<'_>) -> usize {
         self.drain(max, |header, tail| take(header.stamp(), as_bytes(header), tail))
     }
     fn counters(&self) -> ReadCounters {

@@ -3,6 +3,7 @@
 
 use crate::topic::TopicKind;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
@@ -33,6 +34,35 @@ impl Area {
             Self::Output => 'Q',
             Self::Marker => 'M',
         }
+    }
+}
+
+/// Bytes of each area, at most 64 KiB.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct AreaSizes {
+    pub input: u32,
+    pub output: u32,
+    pub marker: u32,
+}
+
+impl AreaSizes {
+    /// The largest areas a plc service can have.
+    pub const MAX: Self = Self { input: 65_536, output: 65_536, marker: 65_536 };
+
+    /// Size of one area in bytes.
+    pub const fn of(self, area: Area) -> u32 {
+        match area {
+            Area::Input => self.input,
+            Area::Output => self.output,
+            Area::Marker => self.marker,
+        }
+    }
+}
+
+impl Default for AreaSizes {
+    /// 4 KiB each, the plc service's default.
+    fn default() -> Self {
+        Self { input: 4096, output: 4096, marker: 4096 }
     }
 }
 
@@ -176,9 +206,16 @@ pub struct Neighbours {
     pub services: Vec<(String, String)>,
     /// Folder of the stack file: relative paths start there.
     pub dir: PathBuf,
+    /// Of each plc service, how its %-addresses count: `element`, `byte` or `openplc`.
+    pub plc_addressing: BTreeMap<String, String>,
 }
 
 impl Neighbours {
+    /// How %-addresses count in the image of this plc service; `element` when it is not known.
+    pub fn addressing(&self, plc: Option<&str>) -> &str {
+        plc.and_then(|plc| self.plc_addressing.get(plc)).map_or("element", String::as_str)
+    }
+
     /// The service named by a key, or the only one of its kind when the key is absent.
     pub fn resolve(&self, kind: &str, named: Option<&str>) -> Option<String> {
         if let Some(name) = named {

@@ -1,83 +1,26 @@
 //! A whole rail in one process: topics made with their limits, messages numbered, gaps counted, full queues
 //! refused, consumers woken. One test function, because a process belongs to one rail for its whole life.
 
-use ipc_types::Context;
+use ipc_types::Wiring;
 use ipc_types::payload::{CanFrame, Event, Inputs};
 use ipc_types::port::SendError;
 use ipc_types::reactor::Reactor;
-use ipc_types::stack::{ServiceEntry, Stack, TopicEntry, Wake};
+use ipc_types::testing::{TestRail, service, topic};
 use ipc_types::topic::{EVENTS, TopicKind};
-use ipc_types::{Wiring, rail};
-use std::collections::BTreeMap;
-use std::path::PathBuf;
 use std::time::Duration;
-
-fn topic(kind: TopicKind, service: &str, depth: u32, wakes: Vec<Wake>) -> TopicEntry {
-    let (max_publishers, max_subscribers) = rail::port_limits(kind, 2, 2);
-    TopicEntry {
-        name: if kind == TopicKind::Events { EVENTS.to_owned() } else { kind.of(service) },
-        kind,
-        depth,
-        max_tail: kind.row().max_tail,
-        writers: vec![service.to_owned()],
-        readers: Vec::new(),
-        wakes,
-        max_publishers,
-        max_subscribers,
-    }
-}
-
-struct Wipe(PathBuf, String);
-impl Drop for Wipe {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-        for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
-            if entry.file_name().to_string_lossy().starts_with(&self.1) {
-                let _ = std::fs::remove_file(entry.path());
-            }
-        }
-    }
-}
 
 #[test]
 fn the_rail_carries_numbers_refuses_and_wakes() {
-    let name = format!("railtest{}", std::process::id());
-    let (root, prefix) = rail::place(0, &name);
-    let _wipe = Wipe(root.clone(), prefix.clone());
-    std::fs::create_dir_all(&root).unwrap();
-    std::fs::write(root.join(rail::CONFIG_FILE), rail::config_text(&root, &prefix)).unwrap();
-    let wake = vec![Wake { service: "a".into(), event_id: 3 }];
-    let stack = Stack {
-        name,
-        file: "test".into(),
-        dir: ".".into(),
-        text: String::new(),
-        build_id: "test".into(),
-        root: root.clone(),
-        prefix,
-        services: vec![ServiceEntry {
-            name: "a".into(),
-            kind: "test".into(),
-            index: 1,
-            config: serde_json::Value::Null,
-            wiring: Wiring::default(),
-        }],
-        topics: vec![
-            topic(TopicKind::Events, "stack", 16, vec![]),
-            topic(TopicKind::Health, "a", 4, vec![]),
-            topic(TopicKind::Status, "a", 4, vec![]),
-            topic(TopicKind::CanRx, "can0", 8, wake.clone()),
-            topic(TopicKind::CanTx, "can0", 4, wake),
-            topic(TopicKind::Inputs, "io", 2, vec![]),
+    let rail = TestRail::new(
+        "railtest",
+        vec![service("a", "test", serde_json::Value::Null, Wiring::default())],
+        vec![
+            topic(TopicKind::CanRx, "can0").depth(8).wakes("a", 3),
+            topic(TopicKind::CanTx, "can0").depth(4).wakes("a", 3),
+            topic(TopicKind::Inputs, "io").depth(2),
         ],
-    };
-    std::fs::write(root.join(rail::STACK_FILE), serde_json::to_vec(&stack).unwrap()).unwrap();
-    rail::join(&root).unwrap();
-    let launcher = rail::node("launcher").unwrap();
-    let mut held: Vec<_> = stack.topics.iter().map(|t| rail::create_topic(&launcher, t).unwrap()).collect();
-    held.push(rail::create_inbox(&launcher, "a", 4).unwrap());
-
-    let mut ctx = Context::service(&root, "a", 1, BTreeMap::new()).unwrap();
+    );
+    let mut ctx = rail.context("a");
     let mut inbox = ctx.inbox().unwrap();
     let mut reactor = Reactor::new().unwrap();
     let token = reactor.add(inbox.fd()).unwrap();

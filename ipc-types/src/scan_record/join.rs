@@ -77,7 +77,7 @@ impl Joiner {
         let mut broken = false;
         let same_writer = stamp.writer == self.last.writer && stamp.generation == self.last.generation;
         if same_writer {
-            lost = stamp.seq.saturating_sub(self.last.seq + 1);
+            lost = stamp.seq.saturating_sub(self.last.seq.saturating_add(1));
         }
         if lost > 0 || !same_writer {
             broken |= self.current.take().is_some();

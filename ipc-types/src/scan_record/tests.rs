@@ -135,6 +135,20 @@ fn losses_are_gaps_and_only_whole_contents_come_out() {
     assert_eq!(send(&mut joiner, &mut seq, 2, 1, &long, &[]), (1, 1));
 }
 
+#[test]
+fn the_last_number_of_a_writer_overflows_nothing() {
+    let mut joiner = Joiner::new(MAX_RECORD_BYTES);
+    let mut push = |seq| {
+        let mut header = part_header(1, 0, 1);
+        header.stamp = Stamp { seq, t_ns: 0, generation: 1, writer: 5 };
+        let step = joiner.push(&header, &[0]);
+        (step.gap.map(|gap| gap.messages), step.whole.is_some())
+    };
+    assert_eq!(push(u64::MAX), (None, true));
+    assert_eq!(push(0), (None, true));
+    assert_eq!(push(u64::MAX), (Some(u64::MAX - 1), true));
+}
+
 proptest! {
     #[test]
     fn any_bytes_are_read_without_panic(bytes in prop::collection::vec(any::<u8>(), 0..400)) {

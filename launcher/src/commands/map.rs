@@ -1,17 +1,18 @@
 //! `dinrail map STACK`: every point of the process image in all its notations, so that nobody counts bytes.
 
 use crate::commands::{print, table};
-use crate::stackfile::{LoadError, area_bytes, exchangers, load, percent};
+use crate::stackfile::{LoadError, exchangers, load, percent};
 use anyhow::Context as _;
 use dinrail_iec::artifact::{AreaKind, Storage, VarKind};
-use dinrail_modbus::address::{Address, Addressing, AreaSizes, Width};
+use dinrail_iec::{Addressing, LocatedAddress};
 use dinrail_modbus::map::RegisterMap;
 use dinrail_modbus::map_config::{MapConfig, MapRow, traditional_number};
 use dinrail_modbus::server::Table;
+use dinrail_modbus::service::addressing_of;
 use dinrail_plc::program;
-use ipc_types::Stack;
 use ipc_types::stack::ServiceEntry;
-use ipc_types::wiring::{Area, ImageRange, OnBad};
+use ipc_types::wiring::{Area, AreaSizes, ImageRange, OnBad};
+use ipc_types::{Stack, plc_table};
 use serde::Serialize;
 use std::path::Path;
 
@@ -99,12 +100,7 @@ fn collect(stack: &Stack) -> anyhow::Result<(Vec<Point>, Vec<ServerMap>)> {
     let mut points = Vec::new();
     let mut servers = Vec::new();
     for plc in stack.services.iter().filter(|s| s.kind == "plc") {
-        let sizes = AreaSizes {
-            input: area_bytes(&plc.config, "input_bytes") as u32,
-            output: area_bytes(&plc.config, "output_bytes") as u32,
-            marker: area_bytes(&plc.config, "marker_bytes") as u32,
-        };
-        let maps = maps_of(stack, plc, sizes)?;
+        let maps = maps_of(stack, plc, plc_table::areas(&plc.config))?;
         for (server, map) in &maps {
             if let Some(server) = server {
                 let ranges = map.rows(Addressing::Element);
@@ -175,26 +171,31 @@ fn maps_of(
     sizes: AreaSizes,
 ) -> anyhow::Result<Vec<(Option<String>, RegisterMap)>> {
     let mut maps = Vec::new();
+    let addressing = addressing_of(Some(plc));
     let servers = stack.services.iter().filter(|s| s.kind == "modbus-server");
     for server in servers.filter(|s| s.wiring.plc.as_deref() == Some(&plc.name)) {
         let config: dinrail_modbus::Config = serde_json::from_value(server.config.clone())
             .with_context(|| format!("configuration of service '{}'", server.name))?;
         let mut map = config
             .map
-            .build(AreaSizes::MAX, config.addressing)
+            .build(AreaSizes::MAX, addressing)
             .with_context(|| format!("map of service '{}'", server.name))?;
         map.set_sizes(sizes);
         maps.push((Some(server.name.clone()), map));
     }
     if maps.is_empty() {
-        let map = MapConfig::default().build(sizes, Addressing::Element).context("default map")?;
+        let map = MapConfig::default().build(sizes, addressing).context("default map")?;
         maps.push((None, map));
     }
     Ok(maps)
 }
 
-/// Where a map shows an address: as a bit or a register, else as a bit of a register.
-fn registers(server: Option<&String>, map: &RegisterMap, address: Address) -> Vec<Register> {
+/// Where a map shows a place: as a bit or a register, else as a bit of a register.
+fn registers(
+    server: Option<&String>,
+    map: &RegisterMap,
+    (area, byte, bit): (Area, u32, Option<u8>),
+) -> Vec<Register> {
     let register = |(table, at): (Table, u16), bit| Register {
         server: server.cloned(),
         table: table.name(),
@@ -203,17 +204,14 @@ fn registers(server: Option<&String>, map: &RegisterMap, address: Address) -> Ve
         bit,
     };
     let direct: Vec<Register> =
-        map.entries_at(address).into_iter().map(|entry| register(entry, None)).collect();
-    if !direct.is_empty() || address.width != Width::Bit {
-        return direct;
-    }
-    let word = Address { width: Width::Word, byte: address.byte & !1, bit: 0, ..address };
+        map.entries_at(area, byte, bit).into_iter().map(|entry| register(entry, None)).collect();
+    let Some(bit) = bit.filter(|_| direct.is_empty()) else { return direct };
     let rows = map.rows(Addressing::Element);
     let swapped = |(table, at)| {
         rows.iter().any(|r| r.table == table && r.swap_bytes && (r.first..=r.last).contains(&at))
     };
-    let bit = (address.byte % 2) as u8 * 8 + address.bit;
-    let entries = map.entries_at(word).into_iter();
+    let bit = (byte % 2) as u8 * 8 + bit;
+    let entries = map.entries_at(area, byte & !1, None).into_iter();
     entries.map(|entry| register(entry, Some(if swapped(entry) { bit ^ 8 } else { bit }))).collect()
 }
 
@@ -224,24 +222,15 @@ fn point(
     role: Role,
     maps: &[(Option<String>, RegisterMap)],
 ) -> Point {
-    let width = match (range.bit, range.bytes) {
-        (Some(_), _) => Some(Width::Bit),
-        (None, 1) => Some(Width::Byte),
-        (None, 2) => Some(Width::Word),
-        (None, 4) => Some(Width::Double),
-        (None, 8) => Some(Width::Long),
-        _ => None,
-    };
-    let address = |width| Address { area: range.area, width, byte: range.byte, bit: range.bit.unwrap_or(0) };
+    let at = LocatedAddress::new(range.area.letter(), range.byte, range.bit, range.bytes);
     let modbus = maps
         .iter()
-        .flat_map(|(server, map)| registers(server.as_ref(), map, address(width.unwrap_or(Width::Byte))))
+        .flat_map(|(server, map)| registers(server.as_ref(), map, (range.area, range.byte, range.bit)))
         .collect();
-    let whole = |w: &Width| range.byte.is_multiple_of(w.bytes());
     Point {
         plc: plc.name.clone(),
-        element: width.filter(whole).map(|w| address(w).text(Addressing::Element)),
-        byte: width.map(|w| address(w).text(Addressing::Byte)),
+        element: at.and_then(|at| at.text(Addressing::Element)),
+        byte: at.and_then(|at| at.text(Addressing::Byte)),
         bytes: percent(range.area, range.byte, range.bit, range.bytes),
         type_name: range.type_name.clone(),
         symbol: range.symbol.clone(),
@@ -353,8 +342,7 @@ mod tests {
         assert_eq!(servers.len(), 1);
         let (_, map) =
             &maps_of(&loaded.stack, loaded.stack.service("plc").unwrap(), AreaSizes::MAX).unwrap()[0];
-        let bit = Address { area: Area::Marker, width: Width::Bit, byte: 7, bit: 2 };
-        let found = registers(None, map, bit);
+        let found = registers(None, map, (Area::Marker, 7, Some(2)));
         assert_eq!((found[0].number.as_str(), found[0].bit), ("40004", Some(10)));
         assert!(text(&points, &servers).contains("registers of 'modbus' over the image of 'plc'"));
         assert_eq!(text(&[], &[]), "no point matches\n");

@@ -49,7 +49,7 @@ pub const CAN: &[KeyDoc] = &[
         "client_buffer",
         Size,
         "\"1MiB\"",
-        "Bytes that wait for one TCP client, 4KiB to 64MiB; a client that reads too slowly is dropped.",
+        "Bytes that wait for one TCP client, 4KiB to 64MiB; a client that reads too slowly misses frames, and stays.",
     ),
     with("serve", Table, "{}", "Servers for foreign tools such as python-can."),
     may(
@@ -106,12 +106,6 @@ pub const CAN_IO: &[KeyDoc] = &[
         "The can service whose frames are taken and sent.",
     ),
     may("plc", Service("plc"), "the only plc of the stack", "The plc service whose image is exchanged."),
-    with(
-        "addressing",
-        Choice(&["element", "byte", "openplc"]),
-        "\"element\"",
-        "How %-addresses of this table count; as the same key of the plc service.",
-    ),
     with("echo", Bool, "false", "Take frames that the stack itself sent, too."),
     with(
         "stale_after",

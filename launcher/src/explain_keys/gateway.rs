@@ -72,12 +72,6 @@ pub const MODBUS_SERVER: &[KeyDoc] = &[
         "The server owns this part of %I: clients write it, the program reads it.",
     ),
     with(
-        "addressing",
-        Choice(&["element", "byte", "openplc"]),
-        "\"element\"",
-        "How %-addresses of this table count; as the same key of the plc service.",
-    ),
-    with(
         "on_stop",
         Choice(&["exception", "hold"]),
         "\"exception\"",

@@ -4,15 +4,13 @@
 use super::document::Document;
 use super::place::Sink;
 use super::resolve::{PLC, exchangers};
+use ipc_types::plc_table;
 use ipc_types::stack::{Severity, Stack};
-use ipc_types::units::Size;
 use ipc_types::wiring::{Area, ImageRange};
 use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::path::Path;
 
-/// Bytes of an area when the plc's table says nothing.
-const AREA_BYTES: u64 = 4096;
 /// Key of a plc's table that findings about its program name.
 const PROGRAM_KEY: &str = "program";
 
@@ -150,7 +148,7 @@ fn inside(points: &[Point<'_>], plc: &str, config: &serde_json::Value, sink: &mu
             Area::Output => "output_bytes",
             Area::Marker => "marker_bytes",
         };
-        let size = area_bytes(config, key);
+        let size = u64::from(plc_table::areas(config).of(point.range.area));
         let end = bits(point.range).1.div_ceil(8);
         let status_end = point.range.status_byte.map_or(0, |b| u64::from(b) + 1);
         let letter = point.range.area.letter();
@@ -181,15 +179,6 @@ fn inside(points: &[Point<'_>], plc: &str, config: &serde_json::Value, sink: &mu
                 ),
             );
         }
-    }
-}
-
-/// Size of an area by the plc's own table.
-pub fn area_bytes(config: &serde_json::Value, key: &str) -> u64 {
-    match config.get(key) {
-        Some(serde_json::Value::Number(n)) => n.as_u64().unwrap_or(AREA_BYTES),
-        Some(serde_json::Value::String(text)) => text.parse::<Size>().map_or(AREA_BYTES, |s| s.0),
-        _ => AREA_BYTES,
     }
 }
 

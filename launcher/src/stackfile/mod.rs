@@ -34,7 +34,7 @@ pub mod probe {
     }
 }
 
-pub use checks::{area_bytes, free_shared_memory, percent, readable_size, shared_memory};
+pub use checks::{free_shared_memory, percent, readable_size, shared_memory};
 pub use launch::{LaunchOptions, OnExhausted, StackSettings};
 pub use nearest::{nearest, suggestion};
 pub use place::Located;

@@ -3,13 +3,13 @@
 
 use super::document::Document;
 use super::place::Sink;
+use dinrail_iec::LocatedAddress;
 use dinrail_iec::artifact::{self, AreaKind};
-use dinrail_modbus::address::{Address, AreaSizes, Width};
 use dinrail_modbus::map_config::{MapConfig, MapEntry, traditional_number};
 use dinrail_modbus::server::{Access, Table};
 use dinrail_plc::program;
 use ipc_types::stack::{ServiceEntry, Stack};
-use ipc_types::wiring::Area;
+use ipc_types::wiring::{Area, AreaSizes};
 
 /// Warns once for each `[[service.map]]` table with such a register.
 pub fn check(document: &Document, stack: &Stack, sink: &mut Sink<'_>) {
@@ -18,18 +18,23 @@ pub fn check(document: &Document, stack: &Stack, sink: &mut Sink<'_>) {
             continue;
         };
         let MapConfig::Tables(tables) = &config.map else { continue };
-        let Ok(map) = config.map.build(AreaSizes::MAX, config.addressing) else { continue };
         let plc = server.wiring.plc.as_deref().and_then(|p| stack.service(p));
+        let addressing = dinrail_modbus::service::addressing_of(plc);
+        let Ok(map) = config.map.build(AreaSizes::MAX, addressing) else { continue };
         let mut warned: Vec<usize> = Vec::new();
         for (access, place) in plc.map(|plc| assignments(stack, plc)).unwrap_or_default() {
-            for address in addresses(&access) {
-                for (table, at) in map.entries_at(address) {
+            for (area, byte, bit) in places(&access) {
+                for (table, at) in map.entries_at(area, byte, bit) {
                     let index = tables.iter().position(|t| shows(t, table, at));
                     let Some(index) = index.filter(|i| !warned.contains(i)) else { continue };
                     if map.check(Access::Write, table, at, 1).is_err() {
                         continue;
                     }
                     warned.push(index);
+                    let bytes = if bit.is_some() { 1 } else { 2 };
+                    let address = LocatedAddress::new(area.letter(), byte, bit, bytes);
+                    let address = address.map(|a| a.text(addressing).unwrap_or_else(|| a.to_string()));
+                    let address = address.unwrap_or_default();
                     sink.warning(
                         &document.place(&server.name, &format!("map[{index}]")),
                         format!(
@@ -64,19 +69,16 @@ fn assignments(stack: &Stack, plc: &ServiceEntry) -> Vec<(artifact::Access, Stri
     map.writes.iter().map(|access| (access.clone(), map.place_text(access.statement))).collect()
 }
 
-/// The bit, or the words, that an assignment touches.
-fn addresses(access: &artifact::Access) -> Vec<Address> {
+/// The bit, or the words, that an assignment touches: area, byte, bit.
+fn places(access: &artifact::Access) -> Vec<(Area, u32, Option<u8>)> {
     let area = match access.area {
         AreaKind::Output => Area::Output,
         AreaKind::Marker => Area::Marker,
         AreaKind::Input | AreaKind::Retain | AreaKind::Data => return Vec::new(),
     };
-    let word = |byte| Address { area, width: Width::Word, byte, bit: 0 };
     let first = access.byte & !1;
-    let mut list = match access.bit {
-        Some(bit) => vec![Address { area, width: Width::Bit, byte: access.byte, bit }],
-        None => Vec::new(),
-    };
-    list.extend((first..access.byte.saturating_add(access.bytes.max(1))).step_by(2).map(word));
+    let mut list: Vec<_> = access.bit.map(|bit| (area, access.byte, Some(bit))).into_iter().collect();
+    let words = (first..access.byte.saturating_add(access.bytes.max(1))).step_by(2);
+    list.extend(words.map(|byte| (area, byte, None)));
     list
 }

@@ -5,10 +5,12 @@ use super::document::{Document, Service};
 use super::nearest::nearest;
 use super::place::Sink;
 use super::{Loader, build_id};
+use ipc_types::plc_table;
 use ipc_types::rail::{place, port_limits};
 use ipc_types::stack::{ServiceEntry, Stack, TopicEntry, Wake};
 use ipc_types::topic::{EVENTS, TopicKind, WhenFull};
 use ipc_types::wiring::{Neighbours, TopicDecl, Wiring};
+use std::collections::BTreeMap;
 
 /// Reader and writer name of the launcher itself.
 pub const LAUNCHER: &str = "launcher";
@@ -21,13 +23,23 @@ const EVENT_ID_MAX: u32 = 255;
 pub fn resolve(document: &Document, loader: &Loader<'_>, text: &str, sink: &mut Sink<'_>) -> Stack {
     let kinds: Vec<(String, String)> =
         document.services.iter().map(|s| (s.name.clone(), s.kind.name.to_owned())).collect();
+    let plc_addressing: BTreeMap<String, String> = document
+        .services
+        .iter()
+        .filter(|s| s.kind.name == PLC)
+        .map(|s| (s.name.clone(), plc_table::addressing(&s.json).to_owned()))
+        .collect();
     let services: Vec<ServiceEntry> = document
         .services
         .iter()
         .zip(1..)
         .map(|(service, index)| {
-            let neighbours =
-                Neighbours { name: service.name.clone(), services: kinds.clone(), dir: loader.dir.clone() };
+            let neighbours = Neighbours {
+                name: service.name.clone(),
+                services: kinds.clone(),
+                dir: loader.dir.clone(),
+                plc_addressing: plc_addressing.clone(),
+            };
             ServiceEntry {
                 name: service.name.clone(),
                 kind: service.kind.name.to_owned(),

@@ -25,6 +25,8 @@ use std::collections::VecDeque;
 pub const ABORT_GRACE_NS: u64 = 500_000_000;
 /// So many clean-ups of dead nodes may fail in a row before the stack fails.
 pub const CLEAN_ATTEMPTS: u32 = 3;
+/// Pause between two clean-ups while /dev/shm is full.
+const NO_ROOM_PAUSE_NS: u64 = 500_000_000;
 /// How long the other services wait for the recorders at the start of a stack. A recorder is ready after some
 /// 20 ms; one that is not must not keep a plant from running.
 pub const RECORDER_HEAD_START_NS: u64 = 500_000_000;
@@ -41,6 +43,9 @@ pub struct Policy {
     clean_again: bool,
     clean_round: u64,
     clean_failures: u32,
+    /// When a clean-up that found no room is tried again.
+    clean_retry_at: Option<u64>,
+    no_room: bool,
     term_grace_ns: u64,
     out: Vec<Action>,
 }
@@ -73,6 +78,8 @@ impl Policy {
             clean_again: false,
             clean_round: 0,
             clean_failures: 0,
+            clean_retry_at: None,
+            no_room: false,
             term_grace_ns,
             out: Vec::new(),
         }
@@ -245,6 +252,9 @@ impl Policy {
 
     /// Asks for a clean-up that begins after this moment; returns its number.
     fn request_clean(&mut self) -> u64 {
+        if self.clean_retry_at.is_some() {
+            return self.clean_round + 1;
+        }
         if self.clean_running {
             self.clean_again = true;
             self.clean_round + 1
@@ -263,9 +273,37 @@ impl Policy {
         }
     }
 
+    /// The clean-up could not even begin because /dev/shm is full. That is no fault of what it would clean: it is
+    /// tried again until there is room, and who died waits for it without using up a budget.
+    pub fn clean_has_no_room(&mut self, now: u64) {
+        self.clean_running = false;
+        if self.stopping {
+            return;
+        }
+        if !std::mem::replace(&mut self.no_room, true) {
+            let message = "/dev/shm full: what died is cleaned up and started again when there is room; remove files \
+                           there or make it larger";
+            self.tell(None, EventKind::NoRoom, Level::Fault, message.to_owned(), Value::Null);
+        }
+        self.repeat_round();
+        self.clean_retry_at = Some(now + NO_ROOM_PAUSE_NS);
+    }
+
+    /// The services that wait for the failed round wait for its repetition.
+    fn repeat_round(&mut self) {
+        self.clean_round -= 1;
+        self.clean_again = false;
+        for slot in &mut self.slots {
+            if let Phase::Cleaning { round, .. } = &mut slot.phase {
+                *round = self.clean_round + 1;
+            }
+        }
+    }
+
     /// The clean-up ended; an error says why it failed.
     pub fn clean_done(&mut self, result: Result<(), String>, now: u64) {
         self.clean_running = false;
+        self.no_room = false;
         if self.stopping {
             return;
         }
@@ -281,14 +319,7 @@ impl Policy {
                 );
                 return;
             }
-            // The services that wait for this round wait for its repetition.
-            self.clean_round -= 1;
-            self.clean_again = false;
-            for slot in &mut self.slots {
-                if let Phase::Cleaning { round, .. } = &mut slot.phase {
-                    *round = self.clean_round + 1;
-                }
-            }
+            self.repeat_round();
             self.request_clean();
             return;
         }
@@ -400,6 +431,10 @@ impl Policy {
 
     /// Deadlines that have passed by `now`.
     pub fn tick(&mut self, now: u64) {
+        if self.clean_retry_at.is_some_and(|at| now >= at) && !self.stopping {
+            self.clean_retry_at = None;
+            self.request_clean();
+        }
         for service in 0..self.slots.len() {
             match self.slots[service].phase {
                 Phase::Aborting { kill_at } if now >= kill_at => {
@@ -434,7 +469,8 @@ impl Policy {
             Phase::Waiting { until } => Some(until),
             _ => None,
         };
-        self.slots.iter().filter_map(due).filter(|&t| t != u64::MAX).min()
+        let retry = self.clean_retry_at.filter(|_| !self.stopping);
+        self.slots.iter().filter_map(due).filter(|&t| t != u64::MAX).chain(retry).min()
     }
 
     /// Ends the stack: one service after the other, in reverse order. Asked a second time, kills what is left.

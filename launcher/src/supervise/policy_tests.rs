@@ -67,6 +67,24 @@ fn recorders_start_first_and_stop_last() {
 }
 
 #[test]
+fn a_full_dev_shm_costs_no_budget_and_fails_no_stack() {
+    let mut p = running(vec![Rule::default()]);
+    p.died(0, death(), S);
+    assert_eq!(done(&mut p), [Action::Clean]);
+    let mut now = S;
+    for _ in 0..20 {
+        p.clean_has_no_room(now);
+        assert_eq!(done(&mut p), []);
+        now = p.next_deadline().unwrap();
+        p.tick(now);
+        assert_eq!(done(&mut p), [Action::Clean]);
+    }
+    p.clean_done(Ok(()), now);
+    assert!(done(&mut p).contains(&Action::Spawn { service: 0, generation: 2 }));
+    assert!(p.failed().is_none());
+}
+
+#[test]
 fn a_recorder_that_does_not_get_ready_keeps_nobody_waiting_for_ever() {
     let rec = Rule { recorder: true, ..Rule::default() };
     let mut p = policy(vec![rec, Rule::default()]);

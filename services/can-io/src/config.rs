@@ -3,7 +3,6 @@
 use ipc_types::units::Span;
 use serde::{Deserialize, Deserializer, Serialize, de};
 
-use crate::address::Addressing;
 use crate::protocol::signal::ByteOrder;
 use crate::protocol::value::IecType;
 
@@ -24,9 +23,6 @@ pub struct Config {
     /// The plc service. Default: the only one of the stack.
     #[serde(default)]
     pub plc: Option<String>,
-    /// How addresses are counted; as in the plc service. Default "element".
-    #[serde(default)]
-    pub addressing: Addressing,
     /// Take frames that the stack itself sent. Default false.
     #[serde(default)]
     pub echo: bool,

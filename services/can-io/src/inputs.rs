@@ -293,7 +293,7 @@ mod tests {
             { "id": 0x1A0, "start": 16, "len": 1, "to": "%IX4.0", "timeout": "50ms", "on_bad": "zero" },
             { "id": 0x7FF, "start": 0, "len": 8, "to": "%IB5", "timeout": "100ms", "on_bad": 7 },
         ] });
-        let plan = plan(&serde_json::from_value(config).unwrap());
+        let plan = plan(&serde_json::from_value(config).unwrap(), dinrail_iec::Addressing::Element);
         assert_eq!(plan.mistakes, []);
         InputTable::new(&plan.inputs)
     }

@@ -7,7 +7,6 @@
 //! Storeys: [`protocol`] bits and values, sans-I/O; [`plan`] the stack file resolved; [`inputs`] and [`outputs`] the
 //! tables that frames and images pass through, sans-I/O; the functions below are the service on the rail.
 
-pub mod address;
 pub mod config;
 pub mod inputs;
 pub mod outputs;

@@ -2,9 +2,9 @@
 //!
 //! Sans-I/O: told images and time, it says which frames to send. Nothing allocates after [`OutputTable::new`].
 
-use ipc_types::wiring::Area;
+use dinrail_iec::LocatedAddress;
+use dinrail_iec::artifact::AreaKind;
 
-use crate::address::Address;
 use crate::plan::{OutputFrame, Safe};
 
 /// After a refused frame on change: when to try again.
@@ -84,7 +84,7 @@ impl OutputTable {
             let mut payload = [slot.frame.fill; 64];
             let mut complete = true;
             for point in &slot.frame.signals {
-                let area = if point.from.area == Area::Marker { markers } else { outputs };
+                let area = if point.from.area == AreaKind::Marker { markers } else { outputs };
                 match read(area, point.from) {
                     Some(value) => complete &= point.codec.encode(value, &mut payload),
                     None => complete = false,
@@ -183,14 +183,14 @@ impl Slot {
 }
 
 /// The value at an address as little-endian bytes; a bit as 0 or 1.
-fn read(area: &[u8], address: Address) -> Option<[u8; 8]> {
+fn read(area: &[u8], address: LocatedAddress) -> Option<[u8; 8]> {
     let first = address.byte as usize;
     let mut value = [0u8; 8];
     if let Some(bit) = address.bit {
         value[0] = (area.get(first)? >> bit) & 1;
         return Some(value);
     }
-    let bytes = address.bits as usize / 8;
+    let bytes = address.size.bytes() as usize;
     value.get_mut(..bytes)?.copy_from_slice(area.get(first..first + bytes)?);
     Some(value)
 }
@@ -205,7 +205,10 @@ mod tests {
     const MS: u64 = 1_000_000;
 
     fn table(outputs: Value) -> OutputTable {
-        let plan = plan(&serde_json::from_value(json!({ "out": outputs })).unwrap());
+        let plan = plan(
+            &serde_json::from_value(json!({ "out": outputs })).unwrap(),
+            dinrail_iec::Addressing::Element,
+        );
         assert_eq!(plan.mistakes, []);
         OutputTable::new(&plan.outputs)
     }

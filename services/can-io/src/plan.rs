@@ -1,8 +1,8 @@
 //! From the stack file to tables: every address, identifier and signal resolved, every mistake named.
 
-use ipc_types::wiring::Area;
+use dinrail_iec::artifact::AreaKind;
+use dinrail_iec::{AddressSize, Addressing, LocatedAddress, parse_address};
 
-use crate::address::{self, Address};
 use crate::config::{
     Config, Id, Input, MAX_INPUTS, MAX_OUTPUTS, MAX_SIGNALS, Mode, OnBadValue, OnBadWord, OnStop, OnStopWord,
     Output, OutputSignal,
@@ -34,7 +34,7 @@ pub struct InputPoint {
     /// How it is read.
     pub codec: Codec,
     /// Where it goes.
-    pub to: Address,
+    pub to: LocatedAddress,
     /// Byte of %I for the quality.
     pub status_byte: Option<u32>,
     /// Older is bad.
@@ -49,7 +49,7 @@ pub struct OutputPoint {
     /// How it is written.
     pub codec: Codec,
     /// Where it comes from.
-    pub from: Address,
+    pub from: LocatedAddress,
 }
 
 /// What a frame does in the safe state.
@@ -105,8 +105,8 @@ impl Mistakes {
     }
 }
 
-/// Resolves the table. Entries with a mistake are left out of the plan.
-pub fn plan(config: &Config) -> Plan {
+/// Resolves the table; its addresses count as those of the plc. Entries with a mistake are left out of the plan.
+pub fn plan(config: &Config, addressing: Addressing) -> Plan {
     let mut mistakes = Mistakes(Vec::new());
     for (what, count, limit) in
         [("in", config.inputs.len(), MAX_INPUTS), ("out", config.outputs.len(), MAX_OUTPUTS)]
@@ -121,14 +121,14 @@ pub fn plan(config: &Config) -> Plan {
         .iter()
         .take(MAX_INPUTS)
         .enumerate()
-        .filter_map(|(index, input)| plan_input(config, index, input, &mut mistakes))
+        .filter_map(|(index, input)| plan_input(addressing, index, input, &mut mistakes))
         .collect();
     let outputs: Vec<_> = config
         .outputs
         .iter()
         .take(MAX_OUTPUTS)
         .enumerate()
-        .filter_map(|(index, output)| plan_output(config, index, output, &mut mistakes))
+        .filter_map(|(index, output)| plan_output(addressing, index, output, &mut mistakes))
         .collect();
     overlaps(&inputs, &mut mistakes);
     for (i, frame) in outputs.iter().enumerate() {
@@ -182,12 +182,12 @@ struct Bits<'a> {
 }
 
 fn codec(
-    config: &Config,
+    addressing: Addressing,
     bits: &Bits<'_>,
-    areas: &[Area],
+    areas: &[AreaKind],
     (key, place): (&str, &str),
     mistakes: &mut Mistakes,
-) -> Option<(Codec, Address)> {
+) -> Option<(Codec, LocatedAddress)> {
     let before = mistakes.0.len();
     let signal = Signal::new(bits.start, bits.len, bits.order)
         .map_err(|e| {
@@ -203,9 +203,9 @@ fn codec(
         mistakes.add(&format!("{key}.scale"), message, "scale must not be 0, and both must be finite");
     }
     let place_key = format!("{key}.{place}");
-    let address = match address::parse(bits.address, config.addressing) {
+    let address = match parse_address(bits.address, addressing) {
         Ok(address) if areas.contains(&address.area) => Some(address),
-        Ok(_) if areas == [Area::Input] => {
+        Ok(_) if areas == [AreaKind::Input] => {
             let message = format!("{} is no input: values from the bus go to %I", bits.address);
             mistakes.add(&place_key, message, "write %I..., and copy it in the program or by a route");
             None
@@ -224,10 +224,10 @@ fn codec(
             None
         }
     }?;
-    let iec = bits.iec.unwrap_or_else(|| default_type(address.bits, bits.signed));
-    if iec.bits() != address.bits {
-        let message =
-            format!("{} has {} bits, {} has {}", bits.address, address.bits, iec.name(), iec.bits());
+    let size = address.size;
+    let iec = bits.iec.unwrap_or_else(|| default_type(size, bits.signed));
+    if iec.bits() != size.bits() {
+        let message = format!("{} has {} bits, {} has {}", bits.address, size.bits(), iec.name(), iec.bits());
         mistakes.add(&format!("{key}.type"), message, "use X for BOOL, B, W, D, L for 8, 16, 32, 64 bits");
     }
     let raw = match (bits.float, bits.signed) {
@@ -239,21 +239,26 @@ fn codec(
     (mistakes.0.len() == before).then_some((codec, address))
 }
 
-fn default_type(bits: u32, signed: bool) -> IecType {
-    match (bits, signed) {
-        (1, _) => IecType::Bool,
-        (8, false) => IecType::Usint,
-        (8, true) => IecType::Sint,
-        (16, false) => IecType::Uint,
-        (16, true) => IecType::Int,
-        (32, false) => IecType::Udint,
-        (32, true) => IecType::Dint,
-        (_, false) => IecType::Ulint,
-        (_, true) => IecType::Lint,
+fn default_type(size: AddressSize, signed: bool) -> IecType {
+    match (size, signed) {
+        (AddressSize::Bit, _) => IecType::Bool,
+        (AddressSize::Byte, false) => IecType::Usint,
+        (AddressSize::Byte, true) => IecType::Sint,
+        (AddressSize::Word, false) => IecType::Uint,
+        (AddressSize::Word, true) => IecType::Int,
+        (AddressSize::Dword, false) => IecType::Udint,
+        (AddressSize::Dword, true) => IecType::Dint,
+        (AddressSize::Lword, false) => IecType::Ulint,
+        (AddressSize::Lword, true) => IecType::Lint,
     }
 }
 
-fn plan_input(config: &Config, index: usize, input: &Input, mistakes: &mut Mistakes) -> Option<InputPoint> {
+fn plan_input(
+    addressing: Addressing,
+    index: usize,
+    input: &Input,
+    mistakes: &mut Mistakes,
+) -> Option<InputPoint> {
     let key = format!("in[{index}]");
     let can_id = can_id(input.id, input.ext, &key, mistakes);
     let bits = Bits {
@@ -267,13 +272,13 @@ fn plan_input(config: &Config, index: usize, input: &Input, mistakes: &mut Mista
         address: &input.to,
         iec: input.iec,
     };
-    let resolved = codec(config, &bits, &[Area::Input], (&key, "to"), mistakes);
+    let resolved = codec(addressing, &bits, &[AreaKind::Input], (&key, "to"), mistakes);
     if input.timeout.is_some_and(|t| t.ns() < 1_000_000) {
         mistakes.add(&format!("{key}.timeout"), "a timeout below 1ms is no timeout", "use at least 1ms");
     }
     let status = input.status_to.as_deref().map(|text| {
-        let found = address::parse(text, config.addressing);
-        let byte = found.ok().filter(|a| a.area == Area::Input && a.bits == 8).map(|a| a.byte);
+        let found = parse_address(text, addressing).ok();
+        let byte = found.filter(|a| a.area == AreaKind::Input && a.size == AddressSize::Byte).map(|a| a.byte);
         if byte.is_none() {
             let message = format!("'{text}' is no byte of the inputs");
             mistakes.add(&format!("{key}.status_to"), message, "write %IB and a number, as %IB10");
@@ -299,7 +304,7 @@ fn plan_input(config: &Config, index: usize, input: &Input, mistakes: &mut Mista
 }
 
 fn plan_output(
-    config: &Config,
+    addressing: Addressing,
     index: usize,
     output: &Output,
     mistakes: &mut Mistakes,
@@ -351,7 +356,7 @@ fn plan_output(
         let message = format!("{} signals: a frame has at most {MAX_SIGNALS}", output.signals.len());
         mistakes.add(&format!("{key}.signals"), message, "send them in two frames");
     }
-    let signals = plan_signals(config, output, &key, mistakes);
+    let signals = plan_signals(addressing, output, &key, mistakes);
     let safe = safe_state(output, &signals, &key, mistakes);
     let frame = OutputFrame {
         index,
@@ -367,12 +372,17 @@ fn plan_output(
     (mistakes.0.len() == before).then_some(frame)
 }
 
-fn plan_signals(config: &Config, output: &Output, key: &str, mistakes: &mut Mistakes) -> Vec<OutputPoint> {
+fn plan_signals(
+    addressing: Addressing,
+    output: &Output,
+    key: &str,
+    mistakes: &mut Mistakes,
+) -> Vec<OutputPoint> {
     let mut signals = Vec::new();
     let mut covered = [0u8; 64];
     for (i, signal) in output.signals.iter().take(MAX_SIGNALS).enumerate() {
         let key = format!("{key}.signals[{i}]");
-        let Some(point) = plan_signal(config, signal, &key, mistakes) else { continue };
+        let Some(point) = plan_signal(addressing, signal, &key, mistakes) else { continue };
         let layout = point.codec.signal;
         if layout.frame_bytes() > output.dlc as usize {
             let message =
@@ -393,7 +403,7 @@ fn plan_signals(config: &Config, output: &Output, key: &str, mistakes: &mut Mist
 }
 
 fn plan_signal(
-    config: &Config,
+    addressing: Addressing,
     signal: &OutputSignal,
     key: &str,
     mistakes: &mut Mistakes,
@@ -409,7 +419,8 @@ fn plan_signal(
         address: &signal.from,
         iec: signal.iec,
     };
-    let (codec, from) = codec(config, &bits, &[Area::Output, Area::Marker], (key, "from"), mistakes)?;
+    let (codec, from) =
+        codec(addressing, &bits, &[AreaKind::Output, AreaKind::Marker], (key, "from"), mistakes)?;
     Some(OutputPoint { codec, from })
 }
 
@@ -445,7 +456,7 @@ fn safe_state(output: &Output, signals: &[OutputPoint], key: &str, mistakes: &mu
 fn overlaps(inputs: &[InputPoint], mistakes: &mut Mistakes) {
     let span = |point: &InputPoint| {
         let first = point.to.byte * 8 + u32::from(point.to.bit.unwrap_or(0));
-        (first, first + point.to.bits)
+        (first, first + point.to.size.bits())
     };
     let mut sorted: Vec<&InputPoint> = inputs.iter().collect();
     sorted.sort_by_key(|point| (span(point), point.index));
@@ -464,7 +475,7 @@ mod tests {
     use serde_json::json;
 
     fn planned(value: serde_json::Value) -> Plan {
-        plan(&serde_json::from_value(value).unwrap())
+        plan(&serde_json::from_value(value).unwrap(), Addressing::Element)
     }
 
     fn said(value: serde_json::Value) -> String {
@@ -560,7 +571,7 @@ mod tests {
         in[0].float: a float signal has 32 or 64 bits, not 8 -> set len = 32 or 64, or float = false
         in[0].scale: scale 0 and offset 0 make no value -> scale must not be 0, and both must be finite
         in[0].to: %QB0 is no input: values from the bus go to %I -> write %I..., and copy it in the program or by a route
-        in[0].to: '%IX0.8': bits are 0 to 7; you probably mean %IX1.0 -> the plc service's `addressing` says how numbers are counted
+        in[0].to: `%IX0.8`: a byte has the bits 0 to 7; bit 8 of byte 0 is %IX1.0 -> the plc service's `addressing` says how numbers are counted
         in[0].type: %IB0 has 8 bits, INT has 16 -> use X for BOOL, B, W, D, L for 8, 16, 32, 64 bits
         in[0].timeout: a timeout below 1ms is no timeout -> use at least 1ms
         in[0].status_to: '%IW4' is no byte of the inputs -> write %IB and a number, as %IB10

@@ -1,5 +1,7 @@
 //! The process: rail ports, clocks, the loop.
 
+use dinrail_iec::artifact::AreaKind;
+use dinrail_iec::{Addressing, LocatedAddress};
 use ipc_types::event::{EventKind, Level};
 use ipc_types::inbox::Inbox;
 use ipc_types::payload::{
@@ -11,14 +13,12 @@ use ipc_types::rail::RailError;
 use ipc_types::reactor::{Reactor, Wake};
 use ipc_types::stack::ServiceEntry;
 use ipc_types::topic::TopicKind;
-use ipc_types::units::Span;
-use ipc_types::wiring::{ImageRange, Neighbours, OnBad, TopicDecl};
-use ipc_types::{Context, Finding, Stack, Wiring, clock};
+use ipc_types::wiring::{Area, ImageRange, Neighbours, OnBad, TopicDecl};
+use ipc_types::{Context, Finding, Stack, Wiring, clock, plc_table};
 use serde::Serialize;
 use std::time::Duration;
 use thiserror::Error;
 
-use crate::address::Address;
 use crate::config::{Config, OnBadValue, OnBadWord, SafeOn};
 use crate::inputs::{InputCounters, InputTable, RowStatus};
 use crate::outputs::{OutputCounters, OutputTable};
@@ -32,8 +32,6 @@ const STATUS_BEATS: u32 = 20;
 const REPEAT_NS: u64 = 90_000_000;
 /// Frames taken from the bus before other work has its turn.
 const TAKE_FRAMES: usize = 256;
-/// `stale_after` that suffices whatever the cycle of the plc: twice its repetition.
-const ALWAYS_ENOUGH_NS: u64 = 200_000_000;
 /// Quality events a second that go to the rail.
 const QUALITY_EVENTS: u32 = 20;
 /// Frames shown in the status.
@@ -60,8 +58,9 @@ pub enum RunError {
 
 /// What the service needs of the launcher.
 pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
-    let plan = plan(config);
-    let mut wiring = Wiring { plc: neighbours.resolve("plc", config.plc.as_deref()), ..Wiring::default() };
+    let plc = neighbours.resolve("plc", config.plc.as_deref());
+    let plan = plan(config, addressing_named(neighbours.addressing(plc.as_deref())));
+    let mut wiring = Wiring { plc, ..Wiring::default() };
     let bus = neighbours.resolve("can", config.bus.as_deref());
     if !config.inputs.is_empty() {
         let tail = InputTable::new(&plan.inputs).tail().len() as u32;
@@ -91,6 +90,18 @@ pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
     wiring
 }
 
+/// A name that is none is the plc service's mistake, and found there.
+fn addressing_named(name: &str) -> Addressing {
+    Addressing::from_name(name).unwrap_or_default()
+}
+
+/// The plc service whose image is exchanged, and how its addresses count.
+fn plc_of<'a>(stack: &'a Stack, wiring: &Wiring) -> (Option<&'a ServiceEntry>, Addressing) {
+    let plc = wiring.plc.as_deref().and_then(|plc| stack.service(plc)).filter(|plc| plc.kind == "plc");
+    let addressing = plc.map(|plc| addressing_named(plc_table::addressing(&plc.config)));
+    (plc, addressing.unwrap_or_default())
+}
+
 fn input_range(config: &Config, point: &crate::plan::InputPoint) -> ImageRange {
     let input = &config.inputs[point.index];
     let label = format!("from frame {}, {}", id_text(point.can_id), point.codec.signal.label());
@@ -105,12 +116,17 @@ fn input_range(config: &Config, point: &crate::plan::InputPoint) -> ImageRange {
     range
 }
 
-fn range(at: Address, iec: &str, symbol: Option<String>, label: String, key: String) -> ImageRange {
+fn range(at: LocatedAddress, iec: &str, symbol: Option<String>, label: String, key: String) -> ImageRange {
     ImageRange {
-        area: at.area,
+        area: match at.area {
+            AreaKind::Input => Area::Input,
+            AreaKind::Output => Area::Output,
+            // No address names another area.
+            AreaKind::Marker | AreaKind::Retain | AreaKind::Data => Area::Marker,
+        },
         byte: at.byte,
         bit: at.bit,
-        bytes: at.bits.div_ceil(8),
+        bytes: at.size.bytes(),
         type_name: Some(iec.to_owned()),
         symbol,
         label,
@@ -123,7 +139,8 @@ fn range(at: Address, iec: &str, symbol: Option<String>, label: String, key: Str
 /// Every mistake that can be found without starting.
 pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> {
     let name = &me.name;
-    let mistakes = plan(config).mistakes;
+    let (plc, addressing) = plc_of(stack, &me.wiring);
+    let mistakes = plan(config, addressing).mistakes;
     let mut found: Vec<Finding> =
         mistakes.iter().map(|m| Finding::error(name, &m.key, &m.message, &m.help)).collect();
     if config.inputs.is_empty() && config.outputs.is_empty() {
@@ -135,42 +152,7 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
     if config.bus.is_none() {
         found.extend(no_only_bus(stack, name));
     }
-    let plc = me.wiring.plc.as_deref().and_then(|plc| stack.service(plc));
-    let Some(plc) = plc.filter(|plc| plc.kind == "plc") else { return found };
-    let theirs = plc.config.get("addressing").and_then(|v| v.as_str()).unwrap_or("element");
-    if theirs != config.addressing.name() {
-        let message = format!(
-            "addresses are counted by \"{}\" here and by \"{theirs}\" in '{}'",
-            config.addressing.name(),
-            plc.name
-        );
-        found.push(Finding::error(name, "addressing", message, format!("set addressing = \"{theirs}\"")));
-    }
-    for key in ["cycle", "max_interval"] {
-        let span = plc.config.get(key).and_then(|v| v.as_str()).and_then(|text| text.parse::<Span>().ok());
-        // A plc repeats its image every 100 ms even when its cycle is longer.
-        let least = span.map(|span| Span(span.ns().saturating_mul(3).min(ALWAYS_ENOUGH_NS)));
-        if let Some((span, least)) = span.zip(least)
-            && config.stale_after < least
-        {
-            let message =
-                format!("stale_after {} is less than 3 x {key} {span} of '{}'", config.stale_after, plc.name);
-            found.push(Finding::error(
-                name,
-                "stale_after",
-                message,
-                format!("set stale_after = \"{least}\" or more"),
-            ));
-        }
-    }
-    if config.stale_after.ns() < 1_000_000 {
-        found.push(Finding::error(
-            name,
-            "stale_after",
-            "stale_after must be at least 1ms",
-            "the default is 200ms",
-        ));
-    }
+    found.extend(plc.and_then(|plc| plc_table::check_stale_after(name, config.stale_after, plc)));
     found
 }
 
@@ -261,12 +243,13 @@ struct Service {
 /// Runs until the launcher says stop.
 pub fn run(mut ctx: Context) -> Result<(), RunError> {
     let config: Config = ctx.config()?;
-    let Plan { inputs, outputs, mistakes } = plan(&config);
+    let name = ctx.service.clone();
+    let wiring = ctx.entry().map(|entry| entry.wiring.clone()).unwrap_or_default();
+    let (_, addressing) = plc_of(&ctx.stack, &wiring);
+    let Plan { inputs, outputs, mistakes } = plan(&config, addressing);
     if let Some(mistake) = mistakes.into_iter().next() {
         return Err(RunError::Config { key: mistake.key, message: mistake.message });
     }
-    let name = ctx.service.clone();
-    let wiring = ctx.entry().map(|entry| entry.wiring.clone()).unwrap_or_default();
     let read =
         |suffix: &str| wiring.reads.iter().find(|r| r.topic.ends_with(suffix)).map(|r| r.topic.clone());
     let rx = read("/rx").map(|topic| ctx.subscriber(&topic)).transpose()?;

@@ -46,6 +46,7 @@ fn wiring() {
             ("plc".into(), "plc".into()),
         ],
         dir: ".".into(),
+        ..Neighbours::default()
     };
     let wiring = topics(&config(demo()), &neighbours);
     assert_eq!(wiring.plc.as_deref(), Some("plc"));
@@ -67,6 +68,10 @@ fn wiring() {
         (out.byte, out.bytes, out.symbol.as_deref(), out.key.as_str()),
         (6, 2, Some("Command"), "out[0].signals[0].from")
     );
+    // Addresses count as in the plc.
+    let plc_addressing = [("plc".to_owned(), "byte".to_owned())].into();
+    let counted = topics(&config(demo()), &Neighbours { plc_addressing, ..neighbours.clone() });
+    assert_eq!(counted.outputs[0].byte, 3);
     // Only outputs: nothing of the bus is read.
     let only_out = topics(&config(json!({ "out": demo()["out"] })), &neighbours);
     assert!(only_out.topics.is_empty() && only_out.reads.len() == 1);
@@ -83,6 +88,8 @@ fn findings() {
     let can = || entry("can0", "can", json!({}));
     let plc = |value| entry("plc", "plc", value);
     assert_eq!(said(demo(), vec![can(), plc(json!({ "cycle": "10ms" }))]), "");
+    let bytes = json!({ "in": [{ "id": 1, "start": 0, "len": 16, "to": "%IW40000" }] });
+    assert_eq!(said(bytes, vec![can(), plc(json!({ "addressing": "byte" }))]), "");
     let with = |key: &str, value: Value| {
         let mut table = demo();
         table[key] = value;
@@ -92,7 +99,10 @@ fn findings() {
         said(json!({}), vec![]),
         said(demo(), vec![]),
         said(demo(), vec![can(), entry("can1", "can", json!({})), plc(json!({}))]),
-        said(demo(), vec![can(), plc(json!({ "addressing": "byte" }))]),
+        said(
+            with("in", json!([{ "id": 1, "start": 0, "len": 16, "to": "%IW40000" }])),
+            vec![can(), plc(json!({}))],
+        ),
         said(with("stale_after", json!("25ms")), vec![can(), plc(json!({ "cycle": "10ms" }))]),
         said(with("stale_after", json!("150ms")), vec![can(), plc(json!({ "cycle": "1s" }))]),
         said(with("stale_after", json!("10us")), vec![can(), plc(json!({}))]),
@@ -101,10 +111,10 @@ fn findings() {
         : the service has neither in nor out: it does nothing -> add [[service.in]] or [[service.out]]
         bus: the stack has no service of kind "can" -> add one, as [[service]] with kind = "can"
         bus: the stack has several services of kind "can": can0, can1 -> say which one: bus = "can0"
-        addressing: addresses are counted by "element" here and by "byte" in 'plc' -> set addressing = "byte"
-        stale_after: stale_after 25ms is less than 3 x cycle 10ms of 'plc' -> set stale_after = "30ms" or more
-        stale_after: stale_after 150ms is less than 3 x cycle 1s of 'plc' -> set stale_after = "200ms" or more
-        stale_after: stale_after must be at least 1ms -> the default is 200ms
+        in[0].to: `%IW40000`: the number is too large, an area has at most 65536 bytes -> the plc service's `addressing` says how numbers are counted
+        stale_after: stale_after = 25ms is shorter than 3 times the longest time between two scans of 'plc' -> leave it out (200ms) or set at least "30ms"
+        stale_after: stale_after = 150ms is shorter than 3 times the longest time between two scans of 'plc' -> leave it out (200ms) or set at least "200ms"
+        stale_after: stale_after = 10us is shorter than 3 times the longest time between two scans of 'plc' -> leave it out (200ms) or set at least "30ms"
         "#);
 }
 

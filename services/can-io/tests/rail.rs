@@ -2,62 +2,19 @@
 //! One test function, because a process belongs to one rail for its whole life.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may end like this")]
 
-use std::collections::BTreeMap;
-use std::path::PathBuf;
-use std::time::{Duration, Instant};
-
+use ipc_types::Wiring;
 use ipc_types::payload::{CanFrame, Event, Health, HealthState, Image, Inputs, PlcState, Quality, can_flag};
 use ipc_types::port::{Publisher, SendError, Subscriber};
-use ipc_types::stack::{ServiceEntry, Stack, TopicEntry, Wake};
+use ipc_types::testing::{TestRail, join, service, topic, wait};
 use ipc_types::topic::{EVENTS, TopicKind};
 use ipc_types::wiring::Neighbours;
-use ipc_types::{Context, Wiring, rail};
 use serde_json::json;
+use std::collections::BTreeMap;
+use std::time::Duration;
 
-/// Longest wait for anything; never a measure of speed.
-const PATIENCE: Duration = Duration::from_mins(1);
 const GOOD: u8 = Quality::Good as u8;
 const STALE: u8 = Quality::Stale as u8;
 const NO_DATA: u8 = Quality::NoData as u8;
-
-fn topic(kind: TopicKind, service: &str, max_tail: u32, wake: Option<&str>) -> TopicEntry {
-    let (max_publishers, max_subscribers) = rail::port_limits(kind, 2, 2);
-    TopicEntry {
-        name: if kind == TopicKind::Events { EVENTS.to_owned() } else { kind.of(service) },
-        kind,
-        depth: kind.row().depth,
-        max_tail,
-        writers: vec![service.to_owned()],
-        readers: Vec::new(),
-        wakes: wake.map(|w| Wake { service: w.into(), event_id: 1 }).into_iter().collect(),
-        max_publishers,
-        max_subscribers,
-    }
-}
-
-struct Wipe(PathBuf, String);
-impl Drop for Wipe {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-        for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
-            if entry.file_name().to_string_lossy().starts_with(&self.1) {
-                let _ = std::fs::remove_file(entry.path());
-            }
-        }
-    }
-}
-
-/// Tries again until it gives something.
-fn wait<T>(what: &str, mut attempt: impl FnMut() -> Option<T>) -> T {
-    let end = Instant::now() + PATIENCE;
-    loop {
-        if let Some(result) = attempt() {
-            return result;
-        }
-        assert!(Instant::now() < end, "{what} never came");
-        std::thread::sleep(Duration::from_millis(2));
-    }
-}
 
 struct Plc {
     port: Publisher<Image>,
@@ -91,11 +48,6 @@ fn events(port: &mut Subscriber<Event>, kind: &str) -> Option<String> {
 
 #[test]
 fn frames_and_image() {
-    let name = format!("caniotest{}", std::process::id());
-    let (root, prefix) = rail::place(0, &name);
-    let _wipe = Wipe(root.clone(), prefix.clone());
-    std::fs::create_dir_all(&root).unwrap();
-    std::fs::write(root.join(rail::CONFIG_FILE), rail::config_text(&root, &prefix)).unwrap();
     let config = json!({
         "in": [
             { "id": 0x1A0, "start": 0, "len": 16, "to": "%IW0", "symbol": "Speed", "timeout": "2s" },
@@ -110,57 +62,31 @@ fn frames_and_image() {
     });
     let services =
         vec![("can0".into(), "can".into()), ("io".into(), "can-io".into()), ("plc".into(), "plc".into())];
-    let neighbours = Neighbours { name: "io".into(), services, dir: ".".into() };
+    let neighbours = Neighbours { name: "io".into(), services, ..Neighbours::default() };
     let wiring = dinrail_can_io::topics(&serde_json::from_value(config.clone()).unwrap(), &neighbours);
     let tail = wiring.topics[0].max_tail;
-    let service = |name: &str, index, config, wiring| ServiceEntry {
-        name: name.into(),
-        kind: "x".into(),
-        index,
-        config,
-        wiring,
-    };
-    let stack = Stack {
-        name,
-        file: "test".into(),
-        dir: ".".into(),
-        text: String::new(),
-        build_id: "test".into(),
-        root: root.clone(),
-        prefix,
-        services: vec![
-            service("io", 1, config, wiring),
-            service("probe", 2, serde_json::Value::Null, Wiring::default()),
+    let rail = TestRail::new(
+        "caniotest",
+        vec![
+            service("io", "can-io", config, wiring),
+            service("probe", "test", serde_json::Value::Null, Wiring::default()),
         ],
-        topics: vec![
-            topic(TopicKind::Events, "stack", 8192, None),
-            topic(TopicKind::Health, "io", 0, None),
-            topic(TopicKind::Status, "io", 16384, None),
-            topic(TopicKind::Health, "probe", 0, None),
-            topic(TopicKind::Status, "probe", 16384, None),
-            topic(TopicKind::CanRx, "can0", 0, Some("io")),
-            topic(TopicKind::CanTx, "can0", 0, None),
-            topic(TopicKind::Image, "plc", 64, Some("io")),
-            topic(TopicKind::Inputs, "io", tail, None),
+        vec![
+            topic(TopicKind::CanRx, "can0").wakes("io", 1),
+            topic(TopicKind::CanTx, "can0"),
+            topic(TopicKind::Image, "plc").max_tail(64).wakes("io", 1),
+            topic(TopicKind::Inputs, "io").max_tail(tail),
         ],
-    };
-    std::fs::write(root.join(rail::STACK_FILE), serde_json::to_vec(&stack).unwrap()).unwrap();
-    rail::join(&root).unwrap();
-    let launcher = rail::node("launcher").unwrap();
-    let mut held: Vec<_> = stack.topics.iter().map(|t| rail::create_topic(&launcher, t).unwrap()).collect();
-    held.push(rail::create_inbox(&launcher, "io", 4).unwrap());
-
-    let mut ctx = Context::service(&root, "probe", 1, BTreeMap::new()).unwrap();
+    );
+    let mut ctx = rail.context("probe");
     let mut health = ctx.subscriber::<Health>("io/health").unwrap();
     let mut events_port = ctx.subscriber::<Event>(EVENTS).unwrap();
     let mut inputs = ctx.subscriber::<Inputs>("io/inputs").unwrap();
     let mut tx = ctx.subscriber::<CanFrame>("can0/tx").unwrap();
     let mut rx = ctx.publisher::<CanFrame>("can0/rx").unwrap();
     let mut plc = Plc { port: ctx.publisher("plc/image").unwrap(), scan: 0 };
-    std::thread::spawn(move || {
-        let ctx = Context::service(&root, "io", 1, BTreeMap::new()).unwrap();
-        dinrail_can_io::run(ctx).unwrap();
-    });
+    let root = rail.root().to_owned();
+    std::thread::spawn(move || dinrail_can_io::run(join(&root, "io", BTreeMap::new())).unwrap());
     wait("readiness", || {
         let mut ready = false;
         health.newest(|h, _| ready = h.state == HealthState::Ready as u32);

@@ -9,7 +9,11 @@ use ipc_types::units::{BitRate, Size, Span};
 use serde::{Deserialize, Deserializer, Serialize, de};
 
 use crate::feed;
-use crate::virtual_bus::{CLIENT_QUEUE, MAX_CLIENTS, Settings};
+use crate::protocol::slcan_client::{self, Channel};
+use crate::sys::BAUDS;
+use crate::virtual_bus::{CLIENT_QUEUE, Dialect, MAX_CLIENTS, Settings};
+use crate::wire::netlink::Wanted;
+use crate::wire::port::Target;
 
 /// What stands between this driver and the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -25,13 +29,25 @@ pub enum Backend {
     Socketcand,
 }
 
+impl Backend {
+    /// As the stack file names it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Virtual => "virtual",
+            Self::Socketcan => "socketcan",
+            Self::Slcan => "slcan",
+            Self::Socketcand => "socketcand",
+        }
+    }
+}
+
 /// A service of kind `can`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// Required.
     pub backend: Backend,
-    /// Name of the interface or device; without meaning for `virtual`.
+    /// `can0`; `/dev/ttyACM0` or `tcp://host:port` for slcan; `tcp://host:port/bus` for socketcand.
     #[serde(default)]
     pub interface: Option<String>,
     /// Number for blocks that name a bus by number; default: order in the stack file.
@@ -43,6 +59,24 @@ pub struct Config {
     /// Data bit rate of CAN FD, up to 8M. Default 2M.
     #[serde(default = "default_data_bitrate")]
     pub data_bitrate: BitRate,
+    /// CAN FD. Default: as the interface has it; off for slcan.
+    #[serde(default)]
+    pub fd: Option<bool>,
+    /// Set what of the interface differs, where permitted; false: only compare. Default true.
+    #[serde(default = "default_true")]
+    pub configure: bool,
+    /// First pause before the restart after bus-off, up to 60s; 0 = never. Default 100ms.
+    #[serde(default = "default_restart")]
+    pub restart: Span,
+    /// Receive buffer of the socket, 64KiB - 64MiB. Default 4MiB: about 5,000 frames.
+    #[serde(default = "default_rx_buffer")]
+    pub rx_buffer: Size,
+    /// Rate of the serial device. Default 115200.
+    #[serde(default = "default_baud")]
+    pub baud: u32,
+    /// Ask the serial adapter for stamps. Default false.
+    #[serde(default)]
+    pub timestamps: bool,
     /// Hold frames to the time they take on a wire. Default false: as fast as it goes.
     #[serde(default)]
     pub pace: bool,
@@ -73,6 +107,12 @@ pub struct Serve {
     /// SLCAN over TCP.
     #[serde(default)]
     pub slcan: Option<Endpoint>,
+    /// The cannelloni protocol over TCP.
+    #[serde(default)]
+    pub cannelloni: Option<Endpoint>,
+    /// SLCAN on a pseudo-terminal: path of the link that leads to it.
+    #[serde(default)]
+    pub slcan_pty: Option<PathBuf>,
 }
 
 /// Where a server listens: `"127.0.0.1:29536"` or a table with filter and limit.
@@ -172,6 +212,15 @@ fn default_client_buffer() -> Size {
 fn default_max_clients() -> u32 {
     8
 }
+fn default_restart() -> Span {
+    Span::from_ms(100)
+}
+fn default_rx_buffer() -> Size {
+    Size(4 << 20)
+}
+fn default_baud() -> u32 {
+    115_200
+}
 fn default_gap() -> Span {
     Span::from_ms(100)
 }
@@ -185,8 +234,60 @@ fn default_speed() -> f64 {
 impl Config {
     /// Servers with their names, as `take_fd` and findings name them.
     pub fn endpoints(&self) -> Vec<(&'static str, EndpointTable)> {
-        let named = [("socketcand", &self.serve.socketcand), ("slcan", &self.serve.slcan)];
-        named.into_iter().filter_map(|(name, e)| Some((name, e.as_ref()?.table()))).collect()
+        self.servers().into_iter().map(|(dialect, e)| (dialect.name(), e)).collect()
+    }
+
+    /// TCP servers with what they speak.
+    pub fn servers(&self) -> Vec<(Dialect, EndpointTable)> {
+        let serve = &self.serve;
+        let all = [
+            (Dialect::Socketcand, &serve.socketcand),
+            (Dialect::Slcan, &serve.slcan),
+            (Dialect::Cannelloni, &serve.cannelloni),
+        ];
+        all.into_iter().filter_map(|(dialect, e)| Some((dialect, e.as_ref()?.table()))).collect()
+    }
+
+    /// What the kernel interface shall be like.
+    pub fn wanted(&self) -> Wanted {
+        Wanted {
+            name: self.interface.clone().unwrap_or_default(),
+            bitrate: self.bitrate.0,
+            data_bitrate: self.data_bitrate.0,
+            fd: self.fd,
+            restart_ms: (self.restart.ns() / 1_000_000) as u32,
+            configure: self.configure,
+        }
+    }
+
+    /// How the channel of a serial adapter is opened; `None` when the protocol has no code for a rate.
+    pub fn channel(&self) -> Option<Channel> {
+        let data_rate_code = match self.fd {
+            Some(true) => Some(slcan_client::data_rate_code(self.data_bitrate.0)?),
+            _ => None,
+        };
+        Some(Channel {
+            rate_code: slcan_client::rate_code(self.bitrate.0)?,
+            data_rate_code,
+            timestamps: self.timestamps,
+            restart_ns: self.restart.ns(),
+        })
+    }
+
+    /// Where the adapter or the remote bus is, and the bus's name there.
+    pub fn target(&self) -> Option<(Target, Option<String>)> {
+        let text = self.interface.as_deref()?;
+        match (text.strip_prefix("tcp://"), self.backend) {
+            (None, Backend::Slcan) => Some((Target::Device { path: text.to_owned(), baud: self.baud }, None)),
+            (Some(rest), Backend::Slcan) => address(rest).map(|a| (Target::Tcp(a), None)),
+            (Some(rest), Backend::Socketcand) => {
+                let (host, bus) = rest.split_once('/')?;
+                let named = !bus.is_empty() && bus.len() <= 16 && bus.bytes().all(|c| c.is_ascii_graphic() && c != b'/');
+                let named = named && !bus.contains(['<', '>']);
+                Some((Target::Tcp(address(host)?), named.then(|| bus.to_owned())))
+            }
+            _ => None,
+        }
     }
 
     /// How the virtual bus shall behave.
@@ -208,24 +309,6 @@ impl Config {
         let mut error = |key: &str, message: String, help: &str| {
             found.push(Finding::error(service, key, message, help));
         };
-        match self.backend {
-            Backend::Virtual => {}
-            Backend::Socketcan => error(
-                "backend",
-                "backend \"socketcan\" is not supported yet".into(),
-                "use backend = \"virtual\"; real interfaces come with a later version",
-            ),
-            Backend::Slcan => error(
-                "backend",
-                "backend \"slcan\" is not supported yet".into(),
-                "use backend = \"virtual\"; serial adapters come with a later version",
-            ),
-            Backend::Socketcand => error(
-                "backend",
-                "backend \"socketcand\" is not supported yet".into(),
-                "use backend = \"virtual\" with serve = { socketcand = ... }; the client comes with a later version",
-            ),
-        }
         if !(5_000..=1_000_000).contains(&self.bitrate.0) {
             error("bitrate", format!("bitrate {} is not possible on CAN", self.bitrate), "use 5k to 1M");
         }
@@ -258,9 +341,82 @@ impl Config {
                 "remove the key; clients open the bus by the service's name",
             ));
         }
+        self.backend_findings(service, &mut found);
         self.endpoint_findings(service, &mut found);
         self.feed_findings(service, dir, &mut found);
         found
+    }
+
+    fn backend_findings(&self, service: &str, found: &mut Vec<Finding>) {
+        let mut error = |key: &str, message: String, help: &str| {
+            found.push(Finding::error(service, key, message, help));
+        };
+        if self.restart.ns() > 60_000_000_000 || !self.restart.ns().is_multiple_of(1_000_000) {
+            error("restart", format!("restart {} is out of range", self.restart), "use whole ms up to 60s; 0 = never");
+        }
+        if !(64 << 10..=64 << 20).contains(&self.rx_buffer.0) {
+            error("rx_buffer", format!("rx_buffer {} is out of range", self.rx_buffer), "use 64KiB to 64MiB");
+        }
+        match (self.backend, self.interface.as_deref()) {
+            (Backend::Virtual, _) => {}
+            (Backend::Socketcan, None | Some("")) => error(
+                "interface",
+                "backend \"socketcan\" needs the name of a network interface".into(),
+                "add interface = \"can0\"; `ip -brief link` lists what there is",
+            ),
+            (Backend::Socketcan, Some(name)) if name.len() > 15 || name.contains(['/', ' ']) => error(
+                "interface",
+                format!("'{name}' is no name of a network interface"),
+                "write e.g. \"can0\"; for a serial device use backend = \"slcan\"",
+            ),
+            (Backend::Socketcan, Some(name)) => {
+                let sys = std::path::Path::new("/sys/class/net");
+                if sys.is_dir() && !sys.join(name).exists() {
+                    found.push(Finding::warning(
+                        service,
+                        "interface",
+                        format!("this machine has no interface '{name}' now"),
+                        "the driver waits for it; `ip -brief link` lists what there is",
+                    ));
+                }
+            }
+            (Backend::Slcan, _) => self.slcan_findings(&mut error),
+            (Backend::Socketcand, _) => match self.target() {
+                Some((_, Some(_))) => {}
+                _ => error(
+                    "interface",
+                    "backend \"socketcand\" needs the address of a server and its bus".into(),
+                    "write e.g. interface = \"tcp://192.168.1.7:29536/can0\"",
+                ),
+            },
+        }
+    }
+
+    fn slcan_findings(&self, error: &mut impl FnMut(&str, String, &str)) {
+        if self.target().is_none() {
+            error(
+                "interface",
+                "backend \"slcan\" needs a serial device or an address".into(),
+                "write e.g. interface = \"/dev/ttyACM0\" or \"tcp://192.168.1.7:3333\"; `ls /dev/serial/by-id` lists serial adapters",
+            );
+        }
+        if slcan_client::rate_code(self.bitrate.0).is_none() {
+            error(
+                "bitrate",
+                format!("the SLCAN protocol has no bit rate {}", self.bitrate),
+                "use 10k, 20k, 50k, 83300, 100k, 125k, 250k, 500k, 750k, 800k or 1M",
+            );
+        }
+        if self.fd == Some(true) && slcan_client::data_rate_code(self.data_bitrate.0).is_none() {
+            error(
+                "data_bitrate",
+                format!("the SLCAN protocol has no data bit rate {}", self.data_bitrate),
+                "use 1M to 8M in whole M; most adapters have 2M and 5M",
+            );
+        }
+        if !BAUDS.iter().any(|(rate, _)| *rate == self.baud) {
+            error("baud", format!("a serial port has no rate {}", self.baud), "use e.g. 115200, 921600, 1000000 or 3000000");
+        }
     }
 
     fn endpoint_findings(&self, service: &str, found: &mut Vec<Finding>) {
@@ -318,6 +474,13 @@ impl Config {
             }
         }
     }
+}
+
+/// `host:port`, the host not empty.
+fn address(text: &str) -> Option<String> {
+    let (host, port) = text.rsplit_once(':')?;
+    let good = !host.is_empty() && !host.contains('/') && port.parse::<u16>().is_ok_and(|port| port > 0);
+    good.then(|| text.to_owned())
 }
 
 const _: () = assert!(CLIENT_QUEUE <= 4096 && MAX_CLIENTS <= 32);
@@ -383,9 +546,15 @@ mod tests {
     #[test]
     fn mistakes() {
         let all = [
-            said(json!({ "backend": "socketcan", "interface": "can0" })),
-            said(json!({ "backend": "slcan" })),
+            said(json!({ "backend": "socketcan" })),
+            said(json!({ "backend": "socketcan", "interface": "/dev/ttyACM0", "restart": "2min", "rx_buffer": "1KiB" })),
+            said(json!({ "backend": "socketcan", "interface": "nocan42" })),
+            said(json!({ "backend": "slcan", "bitrate": "33k", "baud": 115201, "fd": true, "data_bitrate": "2500k" })),
+            said(json!({ "backend": "slcan", "interface": "tcp://adapter" })),
             said(json!({ "backend": "socketcand" })),
+            said(json!({ "backend": "socketcand", "interface": "tcp://10.0.0.1:29536" })),
+            said(json!({ "backend": "socketcand", "interface": "tcp://10.0.0.1:29536/can0" })),
+            said(json!({ "backend": "slcan", "interface": "/dev/ttyACM0", "fd": true, "data_bitrate": "5M" })),
             said(
                 json!({ "backend": "virtual", "interface": "can0", "bitrate": "2M", "max_rate": 5, "tx_queue": 0, "client_buffer": "1KiB" }),
             ),
@@ -396,9 +565,6 @@ mod tests {
             said(json!({ "backend": "virtual", "feed": { "file": "no.log", "speed": 0, "gap": "1us" } })),
         ];
         insta::assert_snapshot!(all.join("\n"), @r#"
-        Error backend: backend "socketcan" is not supported yet -> use backend = "virtual"; real interfaces come with a later version
-        Error backend: backend "slcan" is not supported yet -> use backend = "virtual"; serial adapters come with a later version
-        Error backend: backend "socketcand" is not supported yet -> use backend = "virtual" with serve = { socketcand = ... }; the client comes with a later version
         Error bitrate: bitrate 2M is not possible on CAN -> use 5k to 1M
         Error max_rate: max_rate 5 is out of range -> use 100 to 10000000 frames/s
         Error tx_queue: tx_queue 0 is out of range -> use 1 to 4096

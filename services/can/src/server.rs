@@ -12,6 +12,7 @@ use std::os::fd::OwnedFd;
 use std::rc::Rc;
 use std::time::Duration;
 
+use ipc_types::event::Level;
 use ipc_types::net::IpFilter;
 use rustix::time::{Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec};
 use serde::Serialize;
@@ -23,6 +24,7 @@ use tokio::sync::Notify;
 use crate::feed::Player;
 use crate::virtual_bus::{ClientCounters, Dialect, MAX_CLIENTS, Settings, Stopped, Tap, VirtualBus};
 use crate::watch;
+use crate::wire::port::Port;
 
 /// Bytes read from a client at once: about 600 socketcand frames.
 const READ_BYTES: usize = 16 * 1024;
@@ -35,13 +37,17 @@ pub trait Host: Tap {
     fn flush(&mut self);
     /// A client came, left or was refused.
     fn client(&mut self, message: String, refused: bool);
+    /// Something happened to the wire behind the bus; `up`: it carries frames.
+    fn link(&mut self, level: Level, message: String, up: bool) {
+        let _ = (level, message, up);
+    }
 }
 
 /// A connected client, for the status.
 #[derive(Debug, Clone, Serialize)]
 pub struct ClientStatus {
     /// Its address.
-    pub peer: SocketAddr,
+    pub peer: String,
     /// What it speaks.
     pub protocol: Dialect,
     /// Its counters.
@@ -53,7 +59,7 @@ struct Inner<H> {
     bus: VirtualBus,
     host: H,
     feed: Option<Player>,
-    peers: [Option<(SocketAddr, Dialect)>; MAX_CLIENTS],
+    peers: [Option<(String, Dialect)>; MAX_CLIENTS],
     refused: u64,
     alarm_ns: Option<u64>,
 }
@@ -62,6 +68,7 @@ struct Inner<H> {
 pub struct Hub<H: Host> {
     inner: RefCell<Inner<H>>,
     notify: [Notify; MAX_CLIENTS],
+    wire: Notify,
     alarm: AsyncFd<OwnedFd>,
 }
 
@@ -77,11 +84,12 @@ impl<H: Host + 'static> Hub<H> {
                 bus: VirtualBus::new(settings),
                 host,
                 feed,
-                peers: [None; MAX_CLIENTS],
+                peers: std::array::from_fn(|_| None),
                 refused: 0,
                 alarm_ns: None,
             }),
             notify: std::array::from_fn(|_| Notify::new()),
+            wire: Notify::new(),
             alarm: watch::readable(timer)?,
         }))
     }
@@ -103,6 +111,9 @@ impl<H: Host + 'static> Hub<H> {
         while wake != 0 {
             self.notify[wake.trailing_zeros() as usize].notify_one();
             wake &= wake - 1;
+        }
+        if bus.wire_wants() {
+            self.wire.notify_one();
         }
         let next_ns = feed_ns.into_iter().chain(bus_ns).min();
         if next_ns != inner.alarm_ns {
@@ -139,6 +150,11 @@ impl<H: Host + 'static> Hub<H> {
         }
     }
 
+    /// Waits until the wire could have another frame.
+    pub async fn wire_wanted(&self) {
+        self.wire.notified().await;
+    }
+
     /// Looks at bus and host without letting the bus run.
     pub fn look<R>(&self, f: impl FnOnce(&mut VirtualBus, &mut H) -> R) -> R {
         let mut inner = self.inner.borrow_mut();
@@ -152,8 +168,8 @@ impl<H: Host + 'static> Hub<H> {
         let known = inner.peers.iter().enumerate();
         known
             .filter_map(|(number, peer)| {
-                let (peer, protocol) = (*peer)?;
-                Some(ClientStatus { peer, protocol, counters: inner.bus.client_counters(number)? })
+                let (peer, protocol) = peer.as_ref()?;
+                Some(ClientStatus { peer: peer.clone(), protocol: *protocol, counters: inner.bus.client_counters(number)? })
             })
             .collect()
     }
@@ -210,29 +226,42 @@ impl<H: Host + 'static> Hub<H> {
         if !filter.map_or_else(|| peer.ip().to_canonical().is_loopback(), |f| f.allows(peer.ip())) {
             return Err("its address is outside of the filter");
         }
-        let mut inner = self.inner.borrow_mut();
-        let present = inner.peers.iter().flatten().filter(|(_, d)| *d == dialect).count();
-        if present >= max_clients {
-            return Err("max_clients are connected");
+        {
+            let inner = self.inner.borrow();
+            let present = inner.peers.iter().flatten().filter(|(_, d)| *d == dialect).count();
+            if present >= max_clients {
+                return Err("max_clients are connected");
+            }
         }
-        let number = inner.bus.connect(dialect).ok_or("the bus has no room for another client")?;
-        inner.peers[number] = Some((peer, dialect));
-        inner.host.client(format!("{peer} connected ({})", name(dialect)), false);
-        Ok(number)
+        self.enter(&peer.to_string(), dialect).ok_or("the bus has no room for another client")
+    }
+
+    /// A client came.
+    pub(crate) fn enter(&self, peer: &str, dialect: Dialect) -> Option<usize> {
+        let mut inner = self.inner.borrow_mut();
+        let number = inner.bus.connect(dialect)?;
+        inner.peers[number] = Some((peer.to_owned(), dialect));
+        inner.host.client(format!("{peer} connected ({})", dialect.name()), false);
+        Some(number)
     }
 
     async fn talk(self: Rc<Self>, stream: TcpStream, number: usize, peer: SocketAddr, dialect: Dialect) {
         let end = match prepare(&stream) {
-            Ok(()) => self.converse(&stream, number).await,
+            Ok(()) => self.converse(&Port::Tcp(stream), number).await,
             Err(e) => Err(e),
         };
+        self.leave(&peer.to_string(), number, dialect, end);
+    }
+
+    /// A client is gone.
+    pub(crate) fn leave(&self, peer: &str, number: usize, dialect: Dialect, end: io::Result<()>) {
         let mut inner = self.inner.borrow_mut();
         let counters = inner.bus.disconnect(number);
         inner.peers[number] = None;
         let how = end.err().map(|e| format!(" ({e})")).unwrap_or_default();
         let message = format!(
             "{peer} left ({}){how}: {} frames sent, {} received, {} dropped because it did not read, {} commands refused",
-            name(dialect),
+            dialect.name(),
             counters.sent,
             counters.received,
             counters.dropped,
@@ -241,7 +270,7 @@ impl<H: Host + 'static> Hub<H> {
         inner.host.client(message, false);
     }
 
-    async fn converse(&self, stream: &TcpStream, number: usize) -> io::Result<()> {
+    pub(crate) async fn converse(&self, stream: &Port, number: usize) -> io::Result<()> {
         let mut buffer = vec![0u8; READ_BYTES].into_boxed_slice();
         let (mut start, mut end) = (0, 0);
         let mut finished = false;
@@ -274,7 +303,7 @@ impl<H: Host + 'static> Hub<H> {
             let hold_ns = self.inner.borrow().bus.held_until(number);
             tokio::select! {
                 ready = stream.ready(interest.unwrap_or(Interest::READABLE)), if interest.is_some() => {
-                    if wants_read && ready?.is_readable() {
+                    if ready? && wants_read {
                         match stream.try_read(&mut buffer) {
                             Ok(0) => finished = true,
                             Ok(n) => (start, end) = (0, n),
@@ -290,7 +319,7 @@ impl<H: Host + 'static> Hub<H> {
     }
 
     /// Writes what the bus has for the client; true when its socket takes no more now.
-    fn write_out(&self, stream: &TcpStream, number: usize) -> io::Result<bool> {
+    fn write_out(&self, stream: &Port, number: usize) -> io::Result<bool> {
         let mut inner = self.inner.borrow_mut();
         let now_ns = ipc_types::clock::mono_ns();
         loop {
@@ -308,10 +337,10 @@ impl<H: Host + 'static> Hub<H> {
     }
 
     /// Gives the last words a moment to leave.
-    async fn farewell(&self, stream: &TcpStream, number: usize) -> io::Result<()> {
+    async fn farewell(&self, stream: &Port, number: usize) -> io::Result<()> {
         let words = async {
             while self.write_out(stream, number)? {
-                stream.writable().await?;
+                stream.ready(Interest::WRITABLE).await?;
             }
             Ok(())
         };
@@ -319,15 +348,8 @@ impl<H: Host + 'static> Hub<H> {
     }
 }
 
-fn name(dialect: Dialect) -> &'static str {
-    match dialect {
-        Dialect::Socketcand => "socketcand",
-        Dialect::Slcan => "slcan",
-    }
-}
-
 /// Latency before packing; and a peer that vanished without a word frees its place within a minute.
-fn prepare(stream: &TcpStream) -> io::Result<()> {
+pub(crate) fn prepare(stream: &TcpStream) -> io::Result<()> {
     use rustix::net::sockopt;
     stream.set_nodelay(true)?;
     sockopt::set_socket_keepalive(stream, true)?;
@@ -337,7 +359,7 @@ fn prepare(stream: &TcpStream) -> io::Result<()> {
     Ok(())
 }
 
-async fn sleep_until(at_ns: Option<u64>) {
+pub(crate) async fn sleep_until(at_ns: Option<u64>) {
     let now_ns = ipc_types::clock::mono_ns();
     let wait_ns = at_ns.map_or(0, |at_ns| at_ns.saturating_sub(now_ns));
     tokio::time::sleep(Duration::from_nanos(wait_ns)).await;

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use ipc_types::event::{EventKind, Level};
 use ipc_types::inbox::Inbox;
-use ipc_types::payload::{CanFrame, can_flag};
+use ipc_types::payload::{CanFrame, HealthState, can_flag};
 use ipc_types::port::{Publisher, Subscriber};
 use ipc_types::rail::RailError;
 use ipc_types::stack::ServiceEntry;
@@ -23,8 +23,10 @@ use crate::feed::{FeedError, Log, Player};
 use crate::protocol::Frame;
 use crate::server::{ClientStatus, Host, Hub};
 use crate::txqueue::{Pushed, TxCounters};
-use crate::virtual_bus::{BusCounters, Dialect, Origin, Tap, VirtualBus};
-use crate::watch;
+use crate::server_pty::Pty;
+use crate::virtual_bus::{BusCounters, Origin, Tap, VirtualBus, WireCounters};
+use crate::wire::{Line, LinkStatus, remote, socketcan};
+use crate::{protocol, watch};
 
 /// Depth of `rx` for a virtual bus: it is faster than any wire, so its bursts are longer.
 const RX_DEPTH: u32 = 8192;
@@ -36,6 +38,9 @@ const BEAT: Duration = Duration::from_millis(50);
 const STATUS_BEATS: u32 = 20;
 /// Client events a second that go to the rail; a client that reconnects in a loop must not fill the recording.
 const CLIENT_EVENTS: u32 = 20;
+
+/// Events of the wire a second that go to the rail.
+const LINK_EVENTS: u32 = 10;
 
 /// Why the driver ended.
 #[derive(Debug, Error)]
@@ -54,9 +59,17 @@ pub enum RunError {
         /// The system's reason.
         source: std::io::Error,
     },
-    /// A backend that this version has not.
-    #[error("can: backend {0:?} is not supported yet: use backend = \"virtual\"")]
-    Backend(Backend),
+    /// The pseudo-terminal of `serve.slcan_pty`.
+    #[error("can: serve.slcan_pty: cannot make a terminal at {path}: {source}")]
+    Pty {
+        /// The link.
+        path: std::path::PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// Settings that `check` refuses.
+    #[error("can: the settings of backend {0:?} cannot work: `dinrail check` says why")]
+    Settings(Backend),
 }
 
 fn system(what: &'static str) -> impl FnOnce(std::io::Error) -> RunError {
@@ -66,7 +79,9 @@ fn system(what: &'static str) -> impl FnOnce(std::io::Error) -> RunError {
 /// What the driver needs of the launcher.
 pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
     let mut wiring = Wiring::default();
-    wiring.topics.push(TopicDecl::new(TopicKind::CanRx).depth(RX_DEPTH));
+    let rx = TopicDecl::new(TopicKind::CanRx);
+    let rx = if config.backend == Backend::Virtual { rx.depth(RX_DEPTH) } else { rx };
+    wiring.topics.push(rx);
     wiring.own(TopicKind::CanTx);
     wiring.read(TopicKind::CanTx.of(&neighbours.name), true, "");
     for (name, endpoint) in config.endpoints() {
@@ -90,9 +105,6 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
 /// Runs until the launcher says stop.
 pub fn run(ctx: Context) -> Result<(), RunError> {
     let config: Config = ctx.config()?;
-    if config.backend != Backend::Virtual {
-        return Err(RunError::Backend(config.backend));
-    }
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
@@ -110,6 +122,8 @@ struct Rail {
     unpublished: u64,
     event_budget: u32,
     events_left_out: u32,
+    link_budget: u32,
+    link_left_out: u32,
 }
 
 impl Tap for Rail {
@@ -142,6 +156,16 @@ impl Host for Rail {
         let level = if refused { Level::Warning } else { Level::Info };
         self.ctx.event(EventKind::Client, level, message, serde_json::Value::Null);
     }
+
+    fn link(&mut self, level: Level, message: String, up: bool) {
+        self.ctx.set_state(if up { HealthState::Ready } else { HealthState::Degraded });
+        if self.link_budget == 0 {
+            self.link_left_out += 1;
+            return;
+        }
+        self.link_budget -= 1;
+        self.ctx.event(EventKind::BusState, level, message, serde_json::Value::Null);
+    }
 }
 
 impl Rail {
@@ -158,7 +182,9 @@ impl Rail {
                 return;
             }
             let newest = message.flags & can_flag::NEWEST != 0;
-            let pushed = bus.push_rail(&frame, newest, now_ns);
+            // What waited in the topic while a wire was down is as old as its stamp.
+            let since_ns = if bus.has_wire() { message.stamp.t_ns.min(now_ns) } else { now_ns };
+            let pushed = bus.push_rail(&frame, newest, since_ns);
             debug_assert_ne!(pushed, Pushed::Refused, "room was asked for");
         });
         limit > 0 && taken == limit
@@ -169,8 +195,14 @@ impl Rail {
             let message = format!("{} more client events in the last second left out", self.events_left_out);
             self.ctx.event(EventKind::Client, Level::Warning, message, serde_json::Value::Null);
         }
+        if self.link_left_out > 0 {
+            let message = format!("{} more events of the wire in the last second left out", self.link_left_out);
+            self.ctx.event(EventKind::BusState, Level::Warning, message, serde_json::Value::Null);
+        }
         self.event_budget = CLIENT_EVENTS;
         self.events_left_out = 0;
+        self.link_budget = LINK_EVENTS;
+        self.link_left_out = 0;
     }
 }
 
@@ -195,16 +227,23 @@ struct Status<'a> {
     clients: &'a [ClientStatus],
     clients_refused: u64,
     feed_rounds: Option<u64>,
+    /// Not for a virtual bus.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    link: Option<LinkStatus>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    wire: Option<WireCounters>,
 }
 
-fn publish_status(hub: &Hub<Rail>, config: &Config) {
+type Shared = Option<Rc<std::cell::RefCell<LinkStatus>>>;
+
+fn publish_status(hub: &Hub<Rail>, config: &Config, link: &Shared) {
     let clients = hub.clients();
     let (clients_refused, feed_rounds) = (hub.refused(), hub.feed_rounds());
     hub.look(|bus, rail| {
         bus.set_utc_offset(clock::utc_offset_ns());
         let counters = bus.counters();
         let status = Status {
-            backend: "virtual",
+            backend: config.backend.name(),
             bitrate: config.bitrate.0,
             data_bitrate: config.data_bitrate.0,
             pace: config.pace,
@@ -219,6 +258,8 @@ fn publish_status(hub: &Hub<Rail>, config: &Config) {
             clients: &clients,
             clients_refused,
             feed_rounds,
+            link: link.as_ref().map(|link| link.borrow().clone()),
+            wire: bus.wire_counters(),
         };
         rail.ctx.status(&status);
         rail.second();
@@ -250,9 +291,8 @@ async fn serve(mut ctx: Context, config: &Config) -> Result<(), RunError> {
     let inbox_fd = watched(inbox.fd())?;
     let shutdown = watched(ctx.shutdown_fd())?;
     let mut listeners = Vec::new();
-    for (name, endpoint) in config.endpoints() {
-        let dialect = if name == "slcan" { Dialect::Slcan } else { Dialect::Socketcand };
-        listeners.push((listener(ctx.take_fd(name)?)?, dialect, endpoint));
+    for (dialect, endpoint) in config.servers() {
+        listeners.push((listener(ctx.take_fd(dialect.name())?)?, dialect, endpoint));
     }
     let rail = Rail {
         rx: ctx.publisher(&TopicKind::CanRx.of(&service))?,
@@ -262,6 +302,15 @@ async fn serve(mut ctx: Context, config: &Config) -> Result<(), RunError> {
         unpublished: 0,
         event_budget: CLIENT_EVENTS,
         events_left_out: 0,
+        link_budget: LINK_EVENTS,
+        link_left_out: 0,
+    };
+    let pty = match &config.serve.slcan_pty {
+        Some(path) => {
+            let path = rail.ctx.stack.dir.join(path);
+            Some(Pty::new(&path).map_err(|source| RunError::Pty { path, source })?)
+        }
+        None => None,
     };
     let hub =
         Hub::new(config.settings(&service), rail, feed).map_err(system("making the clock of the bus"))?;
@@ -269,16 +318,54 @@ async fn serve(mut ctx: Context, config: &Config) -> Result<(), RunError> {
         let max_clients = endpoint.max_clients as usize;
         tokio::task::spawn_local(hub.clone().serve(listener, dialect, endpoint.filter, max_clients));
     }
-    publish_status(&hub, config);
+    if let Some(pty) = pty {
+        let hub = hub.clone();
+        tokio::task::spawn_local(async move {
+            if let Err(e) = pty.serve(hub).await {
+                tracing::error!("the pseudo-terminal is of no use any more: {e}");
+            }
+        });
+    }
     hub.look(|_, rail| rail.ctx.ready());
+    let link = attach(&hub, config)?;
+    publish_status(&hub, config, &link);
     // Starts the feed.
     hub.turn(|_, _, _| ());
-    work(&hub, config, &mut inbox, &inbox_fd, &shutdown).await
+    work(&hub, config, &link, &mut inbox, &inbox_fd, &shutdown).await
+}
+
+/// Puts the wire behind the bus that the stack file asks for and starts its task.
+fn attach(hub: &Rc<Hub<Rail>>, config: &Config) -> Result<Shared, RunError> {
+    let wrong = || RunError::Settings(config.backend);
+    let interface = config.interface.clone().unwrap_or_default();
+    let line = Line::new(hub.clone(), &interface);
+    let link = line.status.clone();
+    let flight = |frames| hub.look(|bus, _| bus.attach_wire(frames));
+    match config.backend {
+        Backend::Virtual => return Ok(None),
+        Backend::Socketcan => {
+            flight(socketcan::FLIGHT);
+            let settings = socketcan::Settings { wanted: config.wanted(), rx_buffer: config.rx_buffer.0 as usize };
+            tokio::task::spawn_local(socketcan::drive(line, settings));
+        }
+        Backend::Slcan | Backend::Socketcand => {
+            let (target, bus) = config.target().ok_or_else(wrong)?;
+            let peer: Box<dyn protocol::peer::Peer> = if config.backend == Backend::Slcan {
+                Box::new(protocol::slcan_client::Client::new(config.channel().ok_or_else(wrong)?))
+            } else {
+                Box::new(protocol::socketcand_client::Client::new(&bus.ok_or_else(wrong)?))
+            };
+            flight(peer.flight());
+            tokio::task::spawn_local(remote::drive(line, target, peer));
+        }
+    }
+    Ok(Some(link))
 }
 
 async fn work(
     hub: &Rc<Hub<Rail>>,
     config: &Config,
+    link: &Shared,
     inbox: &mut Inbox,
     inbox_fd: &AsyncFd<OwnedFd>,
     shutdown: &AsyncFd<OwnedFd>,
@@ -309,7 +396,7 @@ async fn work(
                 beats += 1;
                 hub.look(|_, rail| rail.ctx.beat());
                 if beats.is_multiple_of(STATUS_BEATS) {
-                    publish_status(hub, config);
+                    publish_status(hub, config, link);
                 }
             }
         }

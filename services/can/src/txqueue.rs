@@ -17,6 +17,8 @@ pub struct Waiting {
     pub frame: Frame,
     /// CLOCK_MONOTONIC in ns at which it (or the value it replaced) was queued.
     pub arrived_ns: u64,
+    /// CLOCK_MONOTONIC in ns at which its present value was queued.
+    pub fresh_ns: u64,
     newest: bool,
 }
 
@@ -64,7 +66,7 @@ impl TxQueue {
     /// A queue for at most `capacity` frames (at least 1).
     pub fn new(capacity: usize) -> Self {
         let capacity = capacity.max(1);
-        let empty = Waiting { frame: Frame::default(), arrived_ns: 0, newest: false };
+        let empty = Waiting { frame: Frame::default(), arrived_ns: 0, fresh_ns: 0, newest: false };
         Self {
             slots: vec![empty; capacity],
             newest_ids: vec![NO_ID; capacity],
@@ -99,6 +101,7 @@ impl TxQueue {
     pub fn push(&mut self, frame: &Frame, newest: bool, now_ns: u64) -> Pushed {
         if newest && let Some(slot) = self.newest_ids.iter().position(|&id| id == frame.can_id) {
             self.slots[slot].frame = *frame;
+            self.slots[slot].fresh_ns = now_ns;
             self.counters.replaced += 1;
             return Pushed::Replaced;
         }
@@ -106,7 +109,7 @@ impl TxQueue {
             self.counters.refused += 1;
             return Pushed::Refused;
         };
-        self.slots[slot as usize] = Waiting { frame: *frame, arrived_ns: now_ns, newest };
+        self.slots[slot as usize] = Waiting { frame: *frame, arrived_ns: now_ns, fresh_ns: now_ns, newest };
         if newest {
             self.newest_ids[slot as usize] = frame.can_id;
         }

@@ -14,8 +14,12 @@
 use std::collections::VecDeque;
 
 use crate::protocol::busload::{LoadMeter, Stuffing, bits};
-use crate::protocol::{Frame, slcan, socketcand};
+use crate::protocol::{Frame, cannelloni, slcan, socketcand};
 use crate::txqueue::{Pushed, TxCounters, TxQueue};
+
+mod wire_side;
+pub use wire_side::{STALE_NS, WireCounters};
+use wire_side::WireSide;
 
 /// Most clients of one bus.
 pub const MAX_CLIENTS: usize = 32;
@@ -40,6 +44,8 @@ pub enum Origin {
     Feed,
     /// The client with this number.
     Client(usize),
+    /// The wire behind the bus.
+    Wire,
 }
 
 /// Is told every frame in the bus's one true order.
@@ -75,12 +81,26 @@ pub enum Dialect {
     Socketcand,
     /// See [`crate::protocol::slcan`].
     Slcan,
+    /// See [`crate::protocol::cannelloni`].
+    Cannelloni,
+}
+
+impl Dialect {
+    /// As keys and messages name it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Socketcand => "socketcand",
+            Self::Slcan => "slcan",
+            Self::Cannelloni => "cannelloni",
+        }
+    }
 }
 
 #[derive(Debug)]
 enum Talk {
     Socketcand { decoder: Box<socketcand::Decoder>, session: socketcand::Session },
     Slcan { decoder: Box<slcan::Decoder>, session: slcan::Session },
+    Cannelloni { decoder: Box<cannelloni::Decoder>, greeted: bool },
 }
 
 /// Counters of one client.
@@ -157,6 +177,7 @@ pub struct VirtualBus {
     frame_ns: u64,
     load: LoadMeter,
     counters: BusCounters,
+    wire: Option<WireSide>,
     utc_offset_ns: i64,
     /// Clients that have new output, and clients whose queue has room again, one bit each.
     output_ready: u32,
@@ -176,6 +197,7 @@ impl VirtualBus {
             frame_ns: 1_000_000_000 / u64::from(settings.max_rate.max(1)),
             load: LoadMeter::default(),
             counters: BusCounters::default(),
+            wire: None,
             utc_offset_ns: 0,
             output_ready: 0,
             room_again: 0,
@@ -198,14 +220,20 @@ impl VirtualBus {
                     Talk::Socketcand { decoder: Box::default(), session: socketcand::Session::default() }
                 }
                 Dialect::Slcan => Talk::Slcan { decoder: Box::default(), session: slcan::Session::default() },
+                Dialect::Cannelloni => Talk::Cannelloni { decoder: Box::default(), greeted: false },
             },
             waiting: VecDeque::with_capacity(CLIENT_QUEUE),
             out: VecDeque::with_capacity(limit),
             hold: None,
             counters: ClientCounters::default(),
         };
-        if dialect == Dialect::Socketcand {
-            client.out.extend(socketcand::HI);
+        let first: &[u8] = match dialect {
+            Dialect::Socketcand => socketcand::HI,
+            Dialect::Cannelloni => cannelloni::GREETING,
+            Dialect::Slcan => &[],
+        };
+        if !first.is_empty() {
+            client.out.extend(first);
             self.output_ready |= 1 << number;
         }
         self.clients[number] = Some(client);
@@ -214,6 +242,7 @@ impl VirtualBus {
 
     /// A client is gone; its waiting frames go with it.
     pub fn disconnect(&mut self, number: usize) -> ClientCounters {
+        self.wire_disown(number);
         let gone = self.clients.get_mut(number).and_then(Option::take);
         gone.map(|client| client.counters).unwrap_or_default()
     }
@@ -233,7 +262,8 @@ impl VirtualBus {
             let (step, frame) = client.step(&mut rest, &self.settings, now_ns);
             if let Some(frame) = frame {
                 client.counters.sent += 1;
-                if self.settings.pace || !client.waiting.is_empty() || !self.allow(now_ns) {
+                let waits = self.settings.pace || self.wire.is_some() || !client.waiting.is_empty();
+                if waits || !self.allow(now_ns) {
                     if let Some(client) = &mut self.clients[number] {
                         client.waiting.push_back((frame, now_ns));
                     }
@@ -288,6 +318,10 @@ impl VirtualBus {
     /// Puts on the bus what can be there by now. Returns when to call again (CLOCK_MONOTONIC ns; `now_ns` itself
     /// when this turn's share is used up), or `None` when nothing waits.
     pub fn run(&mut self, now_ns: u64, tap: &mut impl Tap) -> Option<u64> {
+        if self.wire.is_some() {
+            // The wire takes what waits when it can.
+            return None;
+        }
         for _ in 0..TURN_FRAMES {
             if let Some((frame, origin, end_ns)) = self.on_wire {
                 if end_ns > now_ns {
@@ -350,26 +384,29 @@ impl VirtualBus {
         });
         let (_, origin) = rail.into_iter().chain(feed).chain(clients).min_by_key(|(key, _)| *key)?;
         let (frame, arrived_ns) = match origin {
-            Origin::Rail => self.rail.pop().map(|w| (w.frame, w.arrived_ns))?,
+            Origin::Rail => self.rail.pop().map(|w| (w.frame, w.fresh_ns))?,
             Origin::Feed => self.feed.pop_front()?,
             Origin::Client(number) => {
                 let client = self.clients[number].as_mut()?;
                 self.room_again |= 1 << number;
                 client.waiting.pop_front()?
             }
+            Origin::Wire => return None,
         };
         Some((frame, origin, arrived_ns))
     }
 
     /// The frame has been on the bus: stamp, count, tell everyone but its sender.
     fn on_bus(&mut self, frame: &Frame, origin: Origin, t_ns: u64, tap: &mut impl Tap) {
-        let wire_ns = self.wire_ns(frame);
-        self.load.add(t_ns, wire_ns);
+        if !frame.is_error() {
+            let wire_ns = self.wire_ns(frame);
+            self.load.add(t_ns, wire_ns);
+        }
         self.counters.frames += 1;
         match origin {
             Origin::Rail => self.counters.from_rail += 1,
             Origin::Feed => self.counters.from_feed += 1,
-            Origin::Client(_) => {}
+            Origin::Client(_) | Origin::Wire => {}
         }
         tap.frame(frame, t_ns, origin);
         let utc_ns = t_ns.saturating_add_signed(self.utc_offset_ns);
@@ -384,6 +421,7 @@ impl VirtualBus {
                 Talk::Slcan { session, .. } if session.receives() => {
                     texts.slcan(frame, session.timestamps().then_some(t_ns / 1_000_000))
                 }
+                Talk::Cannelloni { greeted: true, .. } => texts.cannelloni(frame),
                 _ => continue,
             };
             if client.out.len() + text.len() > self.settings.client_buffer {
@@ -498,6 +536,20 @@ impl Client {
                 self.reply(text, settings);
                 (Step::More, frame)
             }
+            Talk::Cannelloni { decoder, greeted } => match decoder.next(rest) {
+                None => (Step::Empty, None),
+                Some(cannelloni::Item::Greeted) => {
+                    *greeted = true;
+                    (Step::More, None)
+                }
+                // Nobody puts an error on a bus on purpose: the far side reports its own, which are none of ours.
+                Some(cannelloni::Item::Frame(frame)) if frame.is_error() => (Step::More, None),
+                Some(cannelloni::Item::Frame(frame)) => (Step::More, Some(frame)),
+                Some(cannelloni::Item::Lost(_)) => {
+                    self.counters.refused += 1;
+                    (Step::Stop(Stopped::Close), None)
+                }
+            },
         }
     }
 
@@ -516,6 +568,7 @@ struct Texts {
     socketcand: ([u8; socketcand::MAX_TEXT], usize),
     slcan: ([u8; slcan::MAX_TEXT], usize),
     slcan_stamped: ([u8; slcan::MAX_TEXT], usize),
+    cannelloni: ([u8; cannelloni::MAX_BYTES], usize),
 }
 
 impl Default for Texts {
@@ -524,6 +577,7 @@ impl Default for Texts {
             socketcand: ([0; socketcand::MAX_TEXT], usize::MAX),
             slcan: ([0; slcan::MAX_TEXT], usize::MAX),
             slcan_stamped: ([0; slcan::MAX_TEXT], usize::MAX),
+            cannelloni: ([0; cannelloni::MAX_BYTES], usize::MAX),
         }
     }
 }
@@ -535,6 +589,14 @@ impl Texts {
             *len = socketcand::encode(frame, utc_ns, text);
         }
         &text[..*len]
+    }
+
+    fn cannelloni(&mut self, frame: &Frame) -> &[u8] {
+        let (bytes, len) = &mut self.cannelloni;
+        if *len == usize::MAX {
+            *len = cannelloni::encode(frame, bytes);
+        }
+        &bytes[..*len]
     }
 
     fn slcan(&mut self, frame: &Frame, stamp_ms: Option<u64>) -> &[u8] {

@@ -1,4 +1,4 @@
-//! Descriptors on the event loop. The one module of this crate with `unsafe`.
+//! Descriptors on the event loop. With [`crate::sys`] the only module of this crate with `unsafe`.
 #![allow(unsafe_code)]
 
 use std::io;
@@ -13,6 +13,12 @@ pub fn readable(fd: OwnedFd) -> io::Result<AsyncFd<OwnedFd>> {
     // SAFETY: an `OwnedFd` is open, belongs to nobody else, always returns the same number, and closes only when
     // the `AsyncFd` that owns it from here on has taken it out of the event loop.
     unsafe { AsyncFd::register_with_interest(fd, Interest::READABLE) }.map_err(io::Error::from)
+}
+
+/// Watches a descriptor for reading and writing; else as [`readable`].
+pub fn both(fd: OwnedFd) -> io::Result<AsyncFd<OwnedFd>> {
+    // SAFETY: as in `readable`.
+    unsafe { AsyncFd::register_with_interest(fd, Interest::READABLE | Interest::WRITABLE) }.map_err(io::Error::from)
 }
 
 #[cfg(test)]

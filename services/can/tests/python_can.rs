@@ -25,18 +25,9 @@ impl Host for Nobody {
     }
 }
 
-/// Path of a python with python-can and pyserial, from DINRAIL_PYTHON.
-fn python() -> Option<String> {
-    let python = std::env::var("DINRAIL_PYTHON").ok().filter(|p| !p.is_empty());
-    if python.is_none() {
-        let forced = std::env::var("DINRAIL_NO_SKIP").is_ok_and(|v| v == "1");
-        assert!(!forced, "DINRAIL_PYTHON is not set and DINRAIL_NO_SKIP=1 forbids to skip");
-        eprintln!(
-            "SKIPPED: set DINRAIL_PYTHON to a python with python-can 4.6.1 and pyserial 3.5 to run this test"
-        );
-    }
-    python
-}
+#[path = "../../../tests/support/python.rs"]
+mod python;
+use python::python;
 
 #[test]
 fn python_can_is_content() {

@@ -1,9 +1,9 @@
 //! The service's table of the stack file.
 
-use crate::address::{Address, AddressError, Addressing, Width};
-use crate::map_config::MapConfig;
+use crate::map_config::{MapConfig, area_of};
 use crate::session::UnitRule;
 use crate::tcp::{Options, WhenFull};
+use dinrail_iec::{AddressError, AddressSize, Addressing, parse_address};
 use ipc_types::image_write::{Builder, Op};
 use ipc_types::net::IpFilter;
 use ipc_types::units::Span;
@@ -81,8 +81,6 @@ pub struct Config {
     /// Units served besides 0 and 255; all when absent.
     pub units: Option<Vec<u8>>,
     pub map: MapConfig,
-    /// How %-addresses in this table count; as the plc service's key.
-    pub addressing: Addressing,
     pub on_stop: OnStop,
     /// Age from which the image is not believed.
     pub stale_after: Span,
@@ -99,7 +97,6 @@ impl Default for Config {
             tcp: Tcp::default(),
             units: None,
             map: MapConfig::default(),
-            addressing: Addressing::Element,
             on_stop: OnStop::Exception,
             stale_after: Span::from_ms(200),
             write_watchdog: None,
@@ -119,8 +116,6 @@ pub enum WatchdogError {
     NotBool { entry: usize, to: String },
     #[error("watchdog value {entry}: {value} does not fit {to}, which takes {low} to {high}")]
     Range { entry: usize, to: String, value: i64, low: i64, high: i64 },
-    #[error("watchdog value {entry}: {to} ends beyond 64 KiB")]
-    TooFar { entry: usize, to: String },
     #[error("watchdog value {entry}: there are too many; at most 16 values are written at once")]
     TooMany { entry: usize },
 }
@@ -133,7 +128,6 @@ impl WatchdogError {
             | Self::Input { entry, .. }
             | Self::NotBool { entry, .. }
             | Self::Range { entry, .. }
-            | Self::TooFar { entry, .. }
             | Self::TooMany { entry } => entry - 1,
         }
     }
@@ -152,11 +146,11 @@ impl Config {
         }
     }
 
-    /// The watchdog's values as one message to the PLC.
-    pub fn watchdog_write(&self) -> Result<Builder, WatchdogError> {
+    /// The watchdog's values as one message to the PLC, whose addresses count in this way.
+    pub fn watchdog_write(&self, addressing: Addressing) -> Result<Builder, WatchdogError> {
         let mut builder = Builder::default();
         for (i, config) in self.watchdog_values.iter().enumerate() {
-            push_value(i + 1, config, self.addressing, &mut builder)?;
+            push_value(i + 1, config, addressing, &mut builder)?;
         }
         Ok(builder)
     }
@@ -170,33 +164,30 @@ fn push_value(
 ) -> Result<(), WatchdogError> {
     let to = || config.to.clone();
     let address =
-        Address::parse(&config.to, addressing).map_err(|source| WatchdogError::Address { entry, source })?;
-    if address.area == Area::Input {
+        parse_address(&config.to, addressing).map_err(|source| WatchdogError::Address { entry, source })?;
+    let (area, offset) = (area_of(address), address.byte);
+    if area == Area::Input {
         return Err(WatchdogError::Input { entry, to: to() });
     }
-    if address.byte + address.width.bytes() > 65536 {
-        return Err(WatchdogError::TooFar { entry, to: to() });
-    }
-    let (area, offset) = (address.area, address.byte);
-    let pushed = match (address.width, config.value) {
-        (Width::Bit, Value::Bool(on)) => {
-            let mask = 1_u8 << address.bit;
+    let pushed = match (address.size, config.value) {
+        (AddressSize::Bit, Value::Bool(on)) => {
+            let mask = 1_u8 << address.bit.unwrap_or(0);
             builder.push(&Op::Mask { area, offset, and: &[!mask], or: &[if on { mask } else { 0 }] })
         }
-        (Width::Bit, Value::Int(_)) => return Err(WatchdogError::NotBool { entry, to: to() }),
-        (width, value) => {
+        (AddressSize::Bit, Value::Int(_)) => return Err(WatchdogError::NotBool { entry, to: to() }),
+        (size, value) => {
             let value = match value {
                 Value::Int(n) => n,
                 Value::Bool(on) => i64::from(on),
             };
-            let bits = width.bytes() * 8;
+            let bits = size.bits();
             let (low, high) =
                 if bits == 64 { (i64::MIN, i64::MAX) } else { (-(1_i64 << (bits - 1)), (1_i64 << bits) - 1) };
             if !(low..=high).contains(&value) {
                 return Err(WatchdogError::Range { entry, to: to(), value, low, high });
             }
             let bytes = value.to_le_bytes();
-            builder.push(&Op::Set { area, offset, bytes: &bytes[..width.bytes() as usize] })
+            builder.push(&Op::Set { area, offset, bytes: &bytes[..size.bytes() as usize] })
         }
     };
     pushed.map_err(|_| WatchdogError::TooMany { entry })

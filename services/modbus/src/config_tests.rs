@@ -27,7 +27,7 @@ fn every_key_is_read() {
              "tcp": { "address": "127.0.0.1", "port": 1502, "max_connections": 2, "idle_timeout": "0",
                       "when_full": "close_oldest_idle",
                       "filter": { "mask": "255.255.255.0", "start": "192.168.1.10", "end": "192.168.1.99" } },
-             "units": [1, 2], "map": "openplc", "addressing": "openplc", "on_stop": "hold", "stale_after": "1s",
+             "units": [1, 2], "map": "openplc", "on_stop": "hold", "stale_after": "1s",
              "write_watchdog": "2s", "watchdog_values": [ { "to": "%QW0", "value": 0 } ] }"#,
     );
     assert!(!config.enable && config.options().idle_timeout.is_none() && !config.options().units.serves(3));
@@ -38,7 +38,7 @@ fn every_key_is_read() {
 #[test]
 fn unknown_keys_are_errors() {
     let error = |json| serde_json::from_str::<Config>(json).unwrap_err().to_string();
-    assert_snapshot!(error(r#"{ "prot": 502 }"#), @"unknown field `prot`, expected one of `enable`, `plc`, `tcp`, `units`, `map`, `addressing`, `on_stop`, `stale_after`, `write_watchdog`, `watchdog_values` at line 1 column 8");
+    assert_snapshot!(error(r#"{ "prot": 502 }"#), @"unknown field `prot`, expected one of `enable`, `plc`, `tcp`, `units`, `map`, `on_stop`, `stale_after`, `write_watchdog`, `watchdog_values` at line 1 column 8");
     assert_snapshot!(error(r#"{ "tcp": { "prot": 502 } }"#), @"unknown field `prot`, expected one of `address`, `port`, `max_connections`, `filter`, `idle_timeout`, `when_full` at line 1 column 17");
     assert_snapshot!(error(r#"{ "on_stop": "stop" }"#), @"unknown variant `stop`, expected `exception` or `hold` at line 1 column 19");
     assert_snapshot!(error(r#"{ "stale_after": 200 }"#), @r#"'200' is not a duration: write a number and a unit, e.g. "500us", "10ms", "1.5s", "2min", "1h" at line 1 column 20"#);
@@ -51,7 +51,7 @@ fn watchdog_values_become_one_message() {
              { "to": "%QB1", "value": 255 }, { "to": "%QW1", "value": -2 }, { "to": "%QD1", "value": 4294967295 },
              { "to": "%QL1", "value": -1 } ] }"#,
     );
-    let builder = config.watchdog_write().unwrap();
+    let builder = config.watchdog_write(Addressing::Element).unwrap();
     let mut output = [0x10; 16];
     for op in image_write::parse(builder.tail()).unwrap() {
         assert!(op.apply(&mut output));
@@ -65,18 +65,20 @@ fn watchdog_values_that_cannot_be_written() {
         let config = parse(&format!(
             r#"{{ "watchdog_values": [ {{ "to": "%QB0", "value": 0 }}, {{ "to": "{to}", "value": {value} }} ] }}"#
         ));
-        let error = config.watchdog_write().unwrap_err();
+        let error = config.watchdog_write(Addressing::Element).unwrap_err();
         assert_eq!(error.index(), 1);
         error.to_string()
     };
-    assert_snapshot!(error("%QW", "0"), @r#"watchdog value 2: '%QW' is not a %-address; write %, I, Q or M, then X, B, W, D or L, then a number, e.g. "%MW0" or "%QX0.3""#);
+    assert_snapshot!(error("%QW", "0"), @"watchdog value 2: `%QW` is not an address: write %I, %Q or %M, a size X, B, W, D or L, and a number, like %IX0.3 or %QW2");
     assert_snapshot!(error("%IW0", "0"), @"watchdog value 2: %IW0 is an input; write a value to %Q or %M");
     assert_snapshot!(error("%QX0.0", "1"), @"watchdog value 2: %QX0.0 is a bit; its value is true or false");
     assert_snapshot!(error("%QW0", "65536"), @"watchdog value 2: 65536 does not fit %QW0, which takes -32768 to 65535");
     assert_snapshot!(error("%QB0", "-129"), @"watchdog value 2: -129 does not fit %QB0, which takes -128 to 255");
-    assert_snapshot!(error("%QB65536", "0"), @"watchdog value 2: %QB65536 ends beyond 64 KiB");
+    assert_snapshot!(error("%QB65536", "0"), @"watchdog value 2: `%QB65536`: the number is too large, an area has at most 65536 bytes");
     let many: Vec<_> =
         (0..17).map(|i| WatchdogValue { to: format!("%QB{i}"), value: Value::Int(0) }).collect();
-    let error = Config { watchdog_values: many, ..Config::default() }.watchdog_write().unwrap_err();
+    let error = Config { watchdog_values: many, ..Config::default() }
+        .watchdog_write(Addressing::Element)
+        .unwrap_err();
     assert_snapshot!(error, @"watchdog value 17: there are too many; at most 16 values are written at once");
 }

@@ -11,7 +11,6 @@
 //! What may never happen here: a panic or an allocation that a client can cause by a request, a write that is
 //! applied in part, an answer from an image that is too old to be true.
 
-pub mod address;
 pub mod config;
 pub mod map;
 pub mod map_config;

@@ -4,11 +4,12 @@
 //! from byte slices and turns writes into a [`WriteSet`]. Registers are 16-bit values: the word at %MW0, whose
 //! bytes lie low byte first in memory, goes out high byte first as the protocol asks.
 
-use crate::address::{Addressing, Area, AreaSizes};
 use crate::map_config::{MapEntry, MapError, Preset};
 use crate::protocol::pdu::Exception;
 use crate::server::{Access, Table, Write};
 use crate::write_set::WriteSet;
+use dinrail_iec::Addressing;
+use ipc_types::wiring::{Area, AreaSizes};
 
 /// A run of entries of one table that lie in one area.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

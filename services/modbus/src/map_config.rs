@@ -1,8 +1,10 @@
 //! Maps as the stack file writes them, the two ready ones, and how `dinrail map` shows them.
 
-use crate::address::{Address, AddressError, Addressing, Area, AreaSizes, Width};
 use crate::map::{Range, RegisterMap};
 use crate::server::Table;
+use dinrail_iec::artifact::AreaKind;
+use dinrail_iec::{AddressError, AddressSize, Addressing, LocatedAddress, parse_address};
+use ipc_types::wiring::{Area, AreaSizes};
 use serde::{Deserialize, Deserializer, Serialize, de};
 use std::fmt;
 
@@ -148,28 +150,40 @@ pub enum MapError {
     TooMany { got: usize },
 }
 
+/// The area of an address. Addresses name no others than these three.
+pub(crate) fn area_of(address: LocatedAddress) -> Area {
+    match address.area {
+        AreaKind::Input => Area::Input,
+        AreaKind::Output => Area::Output,
+        AreaKind::Marker | AreaKind::Retain | AreaKind::Data => Area::Marker,
+    }
+}
+
 pub(crate) fn preset(preset: Preset, sizes: AreaSizes, addressing: Addressing) -> RegisterMap {
-    let range = |at, most: u32, area, width: Width| {
-        let entry_bits = if width == Width::Bit { 1 } else { 16 };
-        let group = (width.bytes() / 2).max(1);
-        let count = most.min(addressing.room(width, sizes.of(area)) * 8 / entry_bits) / group * group;
-        let base = addressing.base(width);
+    let range = |at, most: u32, area, size: AddressSize| {
+        let entry_bits = if size == AddressSize::Bit { 1 } else { 16 };
+        let group = (size.bytes() / 2).max(1);
+        let count = most.min(addressing.room(size, sizes.of(area)) * 8 / entry_bits) / group * group;
+        let base = addressing.base(size);
         Range { at, count, area, base, group, high_first: group > 1, swap_bytes: false, own: false }
     };
-    let coils = range(0, TABLE_ENTRIES, Area::Output, Width::Bit);
-    let discrete = range(0, TABLE_ENTRIES, Area::Input, Width::Bit);
+    let coils = range(0, TABLE_ENTRIES, Area::Output, AddressSize::Bit);
+    let discrete = range(0, TABLE_ENTRIES, Area::Input, AddressSize::Bit);
     let (input, holding) = match preset {
         Preset::Dinrail => (
-            range(0, TABLE_ENTRIES, Area::Input, Width::Word),
-            vec![range(0, 32768, Area::Marker, Width::Word), range(32768, 32768, Area::Output, Width::Word)],
+            range(0, TABLE_ENTRIES, Area::Input, AddressSize::Word),
+            vec![
+                range(0, 32768, Area::Marker, AddressSize::Word),
+                range(32768, 32768, Area::Output, AddressSize::Word),
+            ],
         ),
         Preset::Openplc => (
-            range(0, 1024, Area::Input, Width::Word),
+            range(0, 1024, Area::Input, AddressSize::Word),
             vec![
-                range(0, 1024, Area::Output, Width::Word),
-                range(1024, 1024, Area::Marker, Width::Word),
-                range(2048, 2048, Area::Marker, Width::Double),
-                range(4096, 4096, Area::Marker, Width::Long),
+                range(0, 1024, Area::Output, AddressSize::Word),
+                range(1024, 1024, Area::Marker, AddressSize::Word),
+                range(2048, 2048, Area::Marker, AddressSize::Dword),
+                range(4096, 4096, Area::Marker, AddressSize::Lword),
             ],
         ),
     };
@@ -219,8 +233,9 @@ fn entry_range(
     addressing: Addressing,
 ) -> Result<Range, MapError> {
     let address =
-        Address::parse(&config.area, addressing).map_err(|source| MapError::Address { entry, source })?;
-    let (table, area) = (config.table.name(), address.area.letter());
+        parse_address(&config.area, addressing).map_err(|source| MapError::Address { entry, source })?;
+    let area_at = area_of(address);
+    let (table, area) = (config.table.name(), area_at.letter());
     let got = || config.area.clone();
     let bits = config.table.is_bits();
     if config.count == 0 {
@@ -230,13 +245,13 @@ fn entry_range(
     if end > u64::from(TABLE_ENTRIES) {
         return Err(MapError::PastTable { entry, table, at: config.at, last: end - 1 });
     }
-    match address.width {
-        Width::Bit | Width::Byte if bits => {}
+    match address.size {
+        AddressSize::Bit | AddressSize::Byte if bits => {}
         _ if bits => return Err(MapError::NotBits { entry, table, area, got: got() }),
-        Width::Bit => return Err(MapError::NotWords { entry, table, area, got: got() }),
+        AddressSize::Bit => return Err(MapError::NotWords { entry, table, area, got: got() }),
         _ => {}
     }
-    let group = if bits { 1 } else { (address.width.bytes() / 2).max(1) };
+    let group = if bits { 1 } else { (address.size.bytes() / 2).max(1) };
     if config.word_order.is_some() && group == 1 {
         return Err(MapError::WordOrder { entry, got: got() });
     }
@@ -246,27 +261,28 @@ fn entry_range(
     if bits && config.swap_bytes {
         return Err(MapError::SwapBits { entry, table });
     }
-    let first_bit = u64::from(address.byte) * 8 + u64::from(address.bit);
+    let bit = address.bit.unwrap_or(0);
+    let first_bit = u64::from(address.byte) * 8 + u64::from(bit);
     let end_bit = first_bit + u64::from(config.count) * if bits { 1 } else { 16 };
     let end_byte = end_bit.div_ceil(8);
-    let size = sizes.of(address.area);
+    let size = sizes.of(area_at);
     if end_byte > u64::from(size) {
         let (at, last) = (config.at, (end - 1) as u32);
         return Err(MapError::PastArea { entry, table, at, last, end: end_byte, area, size });
     }
     if config.own {
         let client_writes = matches!(config.table, Table::Coils | Table::HoldingRegisters);
-        if address.area != Area::Input || !client_writes {
+        if area_at != Area::Input || !client_writes {
             return Err(MapError::Own { entry, table, got: got() });
         }
-        if bits && (address.bit != 0 || !config.count.is_multiple_of(8)) {
+        if bits && (bit != 0 || !config.count.is_multiple_of(8)) {
             return Err(MapError::OwnBits { entry });
         }
     }
     Ok(Range {
         at: config.at,
         count: config.count,
-        area: address.area,
+        area: area_at,
         base: if bits { first_bit as u32 } else { address.byte },
         group,
         high_first: config.word_order == Some(WordOrder::HighFirst),
@@ -346,8 +362,8 @@ impl RegisterMap {
                     last,
                     first_number: traditional_number(table, first),
                     last_number: traditional_number(table, last),
-                    first_address: place(table, range, 0).text(addressing),
-                    last_address: place(table, range, count - 1).text(addressing),
+                    first_address: place(table, range, 0, addressing),
+                    last_address: place(table, range, count - 1, addressing),
                     word_order: (range.group > 1).then_some(if range.high_first {
                         WordOrder::HighFirst
                     } else {
@@ -365,16 +381,15 @@ impl RegisterMap {
 
     /// The entries that show a place of the image: coils and discrete inputs for a bit, for a byte or more the
     /// register where a value that begins there begins (with `high_first` still the lowest of its registers).
-    pub fn entries_at(&self, address: Address) -> Vec<(Table, u16)> {
+    pub fn entries_at(&self, area: Area, byte: u32, bit: Option<u8>) -> Vec<(Table, u16)> {
         let mut found = Vec::new();
         for table in Table::ALL {
-            if table.is_bits() != (address.width == Width::Bit) {
+            if table.is_bits() != bit.is_some() {
                 continue;
             }
-            for range in self.ranges(table).iter().filter(|range| range.area == address.area) {
+            for range in self.ranges(table).iter().filter(|range| range.area == area) {
                 let unit = if table.is_bits() { 1 } else { 2 * range.group };
-                let place =
-                    if table.is_bits() { address.byte * 8 + u32::from(address.bit) } else { address.byte };
+                let place = bit.map_or(byte, |bit| byte * 8 + u32::from(bit));
                 let Some(distance) = place.checked_sub(range.base) else { continue };
                 let step = if table.is_bits() { 1 } else { range.group };
                 let k = distance / unit * step + if range.high_first { 0 } else { distance % unit / 2 };
@@ -387,19 +402,18 @@ impl RegisterMap {
     }
 }
 
-fn place(table: Table, range: &Range, k: u32) -> Address {
-    if table.is_bits() {
+/// Entry `k` of a range as the address of its value; of its first byte where no address names all of it.
+fn place(table: Table, range: &Range, k: u32, addressing: Addressing) -> String {
+    let at = |byte, bit, bytes| LocatedAddress::new(range.area.letter(), byte, bit, bytes);
+    let (whole, first) = if table.is_bits() {
         let bit = range.base + k;
-        return Address { area: range.area, width: Width::Bit, byte: bit / 8, bit: (bit % 8) as u8 };
-    }
-    let byte = range.base + k / range.group * range.group * 2;
-    let width = match range.group {
-        1 if byte.is_multiple_of(2) => Width::Word,
-        2 if byte.is_multiple_of(4) => Width::Double,
-        4 if byte.is_multiple_of(8) => Width::Long,
-        _ => Width::Byte,
+        (at(bit / 8, Some((bit % 8) as u8), 1), None)
+    } else {
+        let byte = range.base + k / range.group * range.group * 2;
+        (at(byte, None, range.group * 2), at(byte, None, 1))
     };
-    Address { area: range.area, width, byte, bit: 0 }
+    let text = whole.and_then(|at| at.text(addressing)).or_else(|| first?.text(addressing));
+    text.or_else(|| Some(whole?.to_string())).unwrap_or_default()
 }
 
 #[cfg(test)]

@@ -40,7 +40,7 @@ fn every_mistake_names_the_table_and_the_remedy() {
     assert_snapshot!(table(r#""table": "holding", "at": 1, "count": 2, "area": "%MW31""#), @"map table 2: holding_registers 1 to 2 reaches byte 66 of %M, which has 64; lower count or raise the size of %M in the plc service");
     assert_snapshot!(table(r#""table": "coils", "at": 1, "count": 2, "area": "%QW0""#), @"map table 2: coils shows single bits, so area must be %QX... or %QB...; got %QW0");
     assert_snapshot!(table(r#""table": "input", "at": 1, "count": 2, "area": "%IX0.0""#), @"map table 2: input_registers shows 16-bit words, so area must be %IB, W, D or L; got %IX0.0");
-    assert_snapshot!(table(r#""table": "input", "at": 1, "count": 2, "area": "%IX0.9""#), @"map table 2: '%IX0.9': bits are 0 to 7; bit 9 of byte 0 is %IX1.1");
+    assert_snapshot!(table(r#""table": "input", "at": 1, "count": 2, "area": "%IX0.9""#), @"map table 2: `%IX0.9`: a byte has the bits 0 to 7; bit 9 of byte 0 is %IX1.1");
     assert_snapshot!(table(r#""table": "input", "at": 1, "count": 2, "area": "%IW0", "word_order": "high_first""#), @"map table 2: word_order needs values of 32 or 64 bits; write area as %xD or %xL, got %IW0");
     assert_snapshot!(table(r#""table": "input", "at": 1, "count": 3, "area": "%ID0""#), @"map table 2: count 3 splits a value; %xD needs a multiple of 2, %xL of 4");
     assert_snapshot!(table(r#""table": "coils", "at": 1, "count": 3, "area": "%QX0.0", "swap_bytes": true"#), @"map table 2: swap_bytes is for registers, coils shows single bits");
@@ -79,9 +79,9 @@ input_registers 0-2047 (30001-32048) %IW0..%IW2047 r
 holding_registers 0-2047 (40001-42048) %MW0..%MW2047 rw
 holding_registers 32768-34815 (432769-434816) %QW0..%QW2047 rw
 "#);
-    let mut map = RegisterMap::preset(Preset::Openplc, AreaSizes::MAX, Addressing::Openplc);
+    let mut map = RegisterMap::preset(Preset::Openplc, AreaSizes::MAX, Addressing::OpenPlc);
     map.set_sizes(AreaSizes { marker: 8192, ..AreaSizes::default() });
-    assert_snapshot!(text(&map, Addressing::Openplc), @r#"
+    assert_snapshot!(text(&map, Addressing::OpenPlc), @r#"
 coils 0-8191 (00001-08192) %QX0.0..%QX1023.7 rw
 discrete_inputs 0-8191 (10001-18192) %IX0.0..%IX1023.7 r
 input_registers 0-1023 (30001-31024) %IW0..%IW1023 r
@@ -89,6 +89,20 @@ holding_registers 0-1023 (40001-41024) %QW0..%QW1023 rw
 holding_registers 1024-2047 (41025-42048) %MW0..%MW1023 rw
 holding_registers 2048-4095 (42049-44096) %MD0..%MD1023 rw
 "#);
+}
+
+#[test]
+fn rows_of_values_that_no_address_names_show_the_first_byte() {
+    let map = |area: &str, addressing| {
+        let table = format!(r#"[{{ "table": "holding", "at": 0, "count": 4, "area": "{area}" }}]"#);
+        let rows = parse(&table).build(AreaSizes::MAX, addressing).unwrap().rows(addressing);
+        (rows[0].first_address.clone(), rows[0].last_address.clone())
+    };
+    let texts = |first: &str, last: &str| (first.to_owned(), last.to_owned());
+    assert_eq!(map("%MB3", Addressing::Element), texts("%MB3", "%MB9"));
+    assert_eq!(map("%MW3", Addressing::Byte), texts("%MW3", "%MW9"));
+    assert_eq!(map("%MW1", Addressing::OpenPlc), texts("%MW1", "%MW4"));
+    assert_eq!(map("%MB1", Addressing::OpenPlc), texts("%MB1", "%MB7"));
 }
 
 #[test]
@@ -107,7 +121,10 @@ fn traditional_numbers() {
 #[test]
 fn entries_of_a_place_are_found() {
     let map = RegisterMap::preset(Preset::Dinrail, SIZES, Addressing::Element);
-    let at = |text| map.entries_at(Address::parse(text, Addressing::Element).unwrap());
+    let at = |text| {
+        let at = parse_address(text, Addressing::Element).unwrap();
+        map.entries_at(area_of(at), at.byte, at.bit)
+    };
     assert_eq!(at("%MW3"), [(Table::HoldingRegisters, 3)]);
     assert_eq!(at("%MD3"), [(Table::HoldingRegisters, 6)]);
     assert_eq!(at("%QW1"), [(Table::HoldingRegisters, 32769)]);
@@ -121,6 +138,9 @@ fn entries_of_a_place_are_found() {
     )
     .build(SIZES, Addressing::Element)
     .unwrap();
-    let at = |text| map.entries_at(Address::parse(text, Addressing::Element).unwrap());
+    let at = |text| {
+        let at = parse_address(text, Addressing::Element).unwrap();
+        map.entries_at(area_of(at), at.byte, at.bit)
+    };
     assert_eq!((at("%MD2"), at("%MD0")), (vec![(Table::HoldingRegisters, 102)], vec![]));
 }

@@ -80,7 +80,7 @@ fn the_largest_areas_fill_the_default_map() {
 
 #[test]
 fn the_openplc_map_has_its_values_high_word_first() {
-    let map = RegisterMap::preset(Preset::Openplc, AreaSizes::MAX, Addressing::Openplc);
+    let map = RegisterMap::preset(Preset::Openplc, AreaSizes::MAX, Addressing::OpenPlc);
     let mut marker = vec![0; 65536];
     marker[1024..1026].copy_from_slice(&7_u16.to_le_bytes());
     marker[4096..4100].copy_from_slice(&0x1122_3344_u32.to_le_bytes());

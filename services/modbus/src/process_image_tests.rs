@@ -1,11 +1,12 @@
 use super::*;
-use crate::address::{Addressing, AreaSizes};
 use crate::map_config::{MapConfig, Preset};
 use crate::protocol::pdu::MAX_PDU;
 use crate::server::answer;
 use crate::testing::{hex, to_hex};
+use dinrail_iec::Addressing;
 use ipc_types::image_write::{self, Op};
 use ipc_types::wiring::Area;
+use ipc_types::wiring::AreaSizes;
 
 const MS: u64 = 1_000_000;
 

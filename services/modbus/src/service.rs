@@ -4,14 +4,14 @@
 //! every 500 us wakes nobody here. A tick every 50 ms beats the heart, notices a PLC that stopped or died,
 //! runs the write watchdog and repeats the owned inputs.
 
-use crate::address::{Address, AreaSizes};
 use crate::config::{Config, MAX_CONNECTIONS};
-use crate::map_config::{MapConfig, MapError, MapRow};
+use crate::map_config::{MapConfig, MapError, area_of};
 use crate::process_image::{Change, NotQueued, ProcessImage, Rail, WriteCounters};
 use crate::readable;
 use crate::tcp::{ClientInfo, Counters, Happening, Hub};
 use crate::view::View;
 use crate::watchdog::{Watchdog, WatchdogState};
+use dinrail_iec::{Addressing, parse_address};
 use ipc_types::event::{EventKind, Level};
 use ipc_types::image_write::Builder;
 use ipc_types::payload::{Image, ImageWrite, Inputs, PlcState};
@@ -19,9 +19,8 @@ use ipc_types::port::{Publisher, ReadCounters, SendError, Subscriber};
 use ipc_types::rail::RailError;
 use ipc_types::stack::ServiceEntry;
 use ipc_types::topic::TopicKind;
-use ipc_types::units::{Size, Span};
-use ipc_types::wiring::{Area, ImageRange, Listener, Neighbours, OnBad, TopicDecl};
-use ipc_types::{Context, Finding, Stack, Wiring, clock};
+use ipc_types::wiring::{Area, AreaSizes, ImageRange, Listener, Neighbours, OnBad, TopicDecl};
+use ipc_types::{Context, Finding, Stack, Wiring, clock, plc_table};
 use serde::Serialize;
 use std::io;
 use std::net::SocketAddr;
@@ -62,10 +61,11 @@ pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
         wiring.write(TopicKind::Writes.of(&plc), "plc");
         wiring.plc = Some(plc);
     }
-    if let Ok(map) = config.map.build(AreaSizes::MAX, config.addressing) {
-        wiring.inputs =
-            map.own_inputs().into_iter().map(|(byte, bytes)| own_range(config, byte, bytes)).collect();
-        wiring.outputs = shown_ranges(config);
+    let addressing = addressing_named(neighbours.addressing(wiring.plc.as_deref()));
+    if let Ok(map) = config.map.build(AreaSizes::MAX, addressing) {
+        let own = map.own_inputs().into_iter();
+        wiring.inputs = own.map(|(byte, bytes)| own_range(config, addressing, byte, bytes)).collect();
+        wiring.outputs = shown_ranges(config, addressing);
     }
     if !wiring.inputs.is_empty() {
         let tail: u32 = wiring.inputs.iter().map(|range| range.bytes + 1).sum();
@@ -80,22 +80,30 @@ pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
     wiring
 }
 
+/// A name that is none is the plc service's mistake, and found there.
+fn addressing_named(name: &str) -> Addressing {
+    Addressing::from_name(name).unwrap_or_default()
+}
+
+/// How the addresses of this plc service's image count.
+pub fn addressing_of(plc: Option<&ServiceEntry>) -> Addressing {
+    plc.map_or_else(Addressing::default, |plc| addressing_named(plc_table::addressing(&plc.config)))
+}
+
 /// The ranges of %Q and %M that map tables show. The ready maps show all of both, which is not listed.
-fn shown_ranges(config: &Config) -> Vec<ImageRange> {
+fn shown_ranges(config: &Config, addressing: Addressing) -> Vec<ImageRange> {
     let MapConfig::Tables(entries) = &config.map else { return Vec::new() };
     let shown = entries.iter().enumerate().filter_map(|(i, entry)| {
-        let address = Address::parse(&entry.area, config.addressing).ok()?;
+        let address = parse_address(&entry.area, addressing).ok()?;
         let bytes = if entry.table.is_bits() {
-            (u32::from(address.bit) + entry.count).div_ceil(8)
+            (u32::from(address.bit.unwrap_or(0)) + entry.count).div_ceil(8)
         } else {
             entry.count * 2
         };
         let label = format!("{} {}-{}", entry.table.name(), entry.at, entry.at + entry.count - 1);
-        let range = ImageRange {
-            area: address.area,
-            ..image_range(address.byte, bytes, label, format!("map[{i}].area"))
-        };
-        (address.area != Area::Input).then_some(range)
+        let area = area_of(address);
+        let range = ImageRange { area, ..image_range(address.byte, bytes, label, format!("map[{i}].area")) };
+        (area != Area::Input).then_some(range)
     });
     shown.collect()
 }
@@ -115,13 +123,13 @@ fn image_range(byte: u32, bytes: u32, label: String, key: String) -> ImageRange 
     }
 }
 
-fn own_range(config: &Config, byte: u32, bytes: u32) -> ImageRange {
+fn own_range(config: &Config, addressing: Addressing, byte: u32, bytes: u32) -> ImageRange {
     // The first table that owns a byte of it; joined neighbours are named by the first.
     let found = match &config.map {
         MapConfig::Tables(entries) => entries.iter().enumerate().find(|(_, entry)| {
             entry.own
-                && Address::parse(&entry.area, config.addressing)
-                    .is_ok_and(|address| address.area == Area::Input && address.byte == byte)
+                && parse_address(&entry.area, addressing)
+                    .is_ok_and(|address| area_of(address) == Area::Input && address.byte == byte)
         }),
         MapConfig::Preset(_) => None,
     };
@@ -137,25 +145,20 @@ fn own_range(config: &Config, byte: u32, bytes: u32) -> ImageRange {
     image_range(byte, bytes, label, key)
 }
 
-/// Lines for `dinrail map`.
-pub fn map_rows(config: &Config, sizes: AreaSizes) -> Result<Vec<MapRow>, MapError> {
-    let mut map = config.map.build(AreaSizes::MAX, config.addressing)?;
-    map.set_sizes(sizes);
-    Ok(map.rows(config.addressing))
-}
-
 /// Every mistake that can be found without starting.
 pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> {
     let service = me.name.as_str();
     let mut findings = Vec::new();
     check_plc(service, config, stack, &mut findings);
     check_tcp(service, config, &mut findings);
-    let sizes = chosen_plc(config, stack).map_or(AreaSizes::MAX, |plc| plc_areas(&plc.config));
-    if let Err(error) = config.map.build(sizes, config.addressing) {
+    let plc = chosen_plc(config, stack);
+    let addressing = addressing_of(plc);
+    let sizes = plc.map_or(AreaSizes::MAX, |plc| plc_table::areas(&plc.config));
+    if let Err(error) = config.map.build(sizes, addressing) {
         let help = "see the page on the Modbus server for what a [[service.map]] table takes";
         findings.push(Finding::error(service, &map_key(&error), error.to_string(), help));
     }
-    check_watchdog(service, config, &mut findings);
+    check_watchdog(service, config, addressing, &mut findings);
     findings
 }
 
@@ -172,32 +175,6 @@ fn chosen_plc<'a>(config: &Config, stack: &'a Stack) -> Option<&'a ServiceEntry>
         Some(name) => plcs.find(|entry| entry.name == *name),
         None => plcs.next().filter(|_| plcs.next().is_none()),
     }
-}
-
-/// Sizes of a plc service's areas, from its table of the stack file.
-pub fn plc_areas(config: &serde_json::Value) -> AreaSizes {
-    let size = |key: &str, default: u32| {
-        let value = config.get(key).and_then(|value| serde_json::from_value::<Size>(value.clone()).ok());
-        value.map_or(default, |size| size.0.min(65536) as u32)
-    };
-    let default = AreaSizes::default();
-    AreaSizes {
-        input: size("input_bytes", default.input),
-        output: size("output_bytes", default.output),
-        marker: size("marker_bytes", default.marker),
-    }
-}
-
-/// The shortest `stale_after` that a healthy plc never reaches: three times the longest time between two scans, and
-/// never more than twice the 100 ms after which every plc repeats its image.
-fn shortest_stale_after(plc: &serde_json::Value) -> Span {
-    let span = |key: &str, default_ms| {
-        let value = plc.get(key).and_then(|value| serde_json::from_value::<Span>(value.clone()).ok());
-        value.unwrap_or(Span::from_ms(default_ms))
-    };
-    let on_inputs = plc.get("trigger").is_some_and(|trigger| trigger == "inputs");
-    let period = if on_inputs { span("max_interval", 100) } else { span("cycle", 10) };
-    Span(period.ns().saturating_mul(3)).min(Span::from_ms(200))
 }
 
 fn check_plc(service: &str, config: &Config, stack: &Stack, findings: &mut Vec<Finding>) {
@@ -217,37 +194,7 @@ fn check_plc(service: &str, config: &Config, stack: &Stack, findings: &mut Vec<F
         findings.push(Finding::error(service, "plc", message, help));
         return;
     };
-    let of_plc = plc.config.get("addressing").cloned().unwrap_or_else(|| "element".into());
-    if serde_json::to_value(config.addressing).is_ok_and(|mine| mine != of_plc) {
-        findings.push(Finding::error(
-            service,
-            "addressing",
-            format!("%-addresses count differently here than in '{}' ({of_plc})", plc.name),
-            format!("set addressing = {of_plc} here too"),
-        ));
-    }
-    let shortest = shortest_stale_after(&plc.config);
-    if config.stale_after < shortest {
-        findings.push(Finding::error(
-            service,
-            "stale_after",
-            format!(
-                "stale_after = {} is shorter than 3 times the longest time between two scans of '{}'",
-                config.stale_after, plc.name
-            ),
-            format!("leave it out (200ms) or set at least \"{shortest}\""),
-        ));
-    } else if config.stale_after < Span::from_ms(50) {
-        findings.push(Finding::warning(
-            service,
-            "stale_after",
-            format!(
-                "stale_after = {} is short: a plc process delayed by the system looks dead",
-                config.stale_after
-            ),
-            "200ms is the default",
-        ));
-    }
+    findings.extend(plc_table::check_stale_after(service, config.stale_after, plc));
 }
 
 fn check_tcp(service: &str, config: &Config, findings: &mut Vec<Finding>) {
@@ -278,13 +225,12 @@ fn check_tcp(service: &str, config: &Config, findings: &mut Vec<Finding>) {
     }
 }
 
-fn check_watchdog(service: &str, config: &Config, findings: &mut Vec<Finding>) {
-    if let Err(error) = config.watchdog_write() {
+fn check_watchdog(service: &str, config: &Config, addressing: Addressing, findings: &mut Vec<Finding>) {
+    if let Err(error) = config.watchdog_write(addressing) {
         let key = format!("watchdog_values[{}]", error.index());
         findings.push(Finding::error(service, &key, error.to_string(), "correct or remove the value"));
     }
-    let owns =
-        config.map.build(AreaSizes::MAX, config.addressing).is_ok_and(|map| !map.own_inputs().is_empty());
+    let owns = config.map.build(AreaSizes::MAX, addressing).is_ok_and(|map| !map.own_inputs().is_empty());
     match config.write_watchdog {
         None if !config.watchdog_values.is_empty() => {
             let help = "set write_watchdog, e.g. \"2s\", or remove the values";
@@ -433,15 +379,16 @@ async fn serve(mut ctx: Context) -> Result<(), ServiceError> {
 fn build_image(ctx: &mut Context, config: &Config, plc: &str) -> Result<ProcessImage<Ports>, ServiceError> {
     let service = ctx.service.clone();
     let rail = |source| ServiceError::Rail { service: service.clone(), source };
+    let addressing = addressing_of(ctx.stack.service(plc));
     let map = config
         .map
-        .build(AreaSizes::MAX, config.addressing)
+        .build(AreaSizes::MAX, addressing)
         .map_err(|source| ServiceError::Map { service: service.clone(), source })?;
     let watchdog = match config.write_watchdog {
         None => None,
         Some(limit) => {
             let values = config
-                .watchdog_write()
+                .watchdog_write(addressing)
                 .map_err(|source| ServiceError::Watchdog { service: service.clone(), source })?;
             Some(Watchdog::new(limit.ns(), values, ctx.generation > 1, clock::mono_ns()))
         }

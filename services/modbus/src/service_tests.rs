@@ -111,7 +111,13 @@ fn findings_name_key_mistake_and_remedy() {
         (&format!("{{ {local} }}"), &[]),
         (&format!("{{ {local} }}"), &[("a", "{}"), ("b", "{}")]),
         (&format!(r#"{{ {local}, "plc": "c" }}"#), &[("a", "{}"), ("b", "{}")]),
-        (&format!("{{ {local} }}"), &[("plc", r#"{ "addressing": "byte" }"#)]),
+        // Fits where addresses count bytes only: as those of the plc.
+        (
+            &format!(
+                r#"{{ {local}, "map": [ {{ "table": "holding", "at": 0, "count": 9, "area": "%MW8" }} ] }}"#
+            ),
+            &[("plc", r#"{ "marker_bytes": "32B" }"#)],
+        ),
         (&format!(r#"{{ {local}, "stale_after": "0" }}"#), &one),
         (&format!(r#"{{ {local}, "stale_after": "10ms" }}"#), &[("plc", r#"{ "cycle": "1ms" }"#)]),
         (&format!(r#"{{ {local}, "stale_after": "199ms" }}"#), &[("plc", r#"{ "trigger": "inputs" }"#)]),
@@ -152,7 +158,7 @@ Error tcp.filter: filter: start 10.0.0.9 lies behind end 10.0.0.1: nobody could 
 Error plc: the stack has no plc service whose image could be served -> add a [[service]] with kind = "plc"; it works without a program too
 Error plc: the stack has 2 plc services; which one is served? -> set plc to one of: a, b
 Error plc: there is no plc service 'c' -> set plc to one of: a, b
-Error addressing: %-addresses count differently here than in 'plc' ("byte") -> set addressing = "byte" here too
+Error map[0]: map table 1: holding_registers 0 to 8 reaches byte 34 of %M, which has 32; lower count or raise the size of %M in the plc service -> see the page on the Modbus server for what a [[service.map]] table takes
 Error stale_after: stale_after = 0ns is shorter than 3 times the longest time between two scans of 'plc' -> leave it out (200ms) or set at least "30ms"
 Warning stale_after: stale_after = 10ms is short: a plc process delayed by the system looks dead -> 200ms is the default
 Error stale_after: stale_after = 199ms is shorter than 3 times the longest time between two scans of 'plc' -> leave it out (200ms) or set at least "200ms"
@@ -164,6 +170,24 @@ Error watchdog_values: values without write_watchdog -> set write_watchdog, e.g.
 Error watchdog_values[0]: watchdog value 1: 256 does not fit %QB0, which takes -128 to 255 -> correct or remove the value
 Error write_watchdog: write_watchdog = 50ms is shorter than it is looked at -> set at least "100ms", and twice the clients' period
 "#);
+}
+
+#[test]
+fn addresses_count_as_in_the_plc() {
+    let config = config(
+        r#"{ "tcp": { "address": "127.0.0.1" }, "map": [
+            { "table": "holding", "at": 0, "count": 9, "area": "%MW8" },
+            { "table": "holding", "at": 9, "count": 2, "area": "%IW8", "own": true } ] }"#,
+    );
+    assert_eq!(
+        check_it(&config, &stack(&[("plc", r#"{ "marker_bytes": "32B", "addressing": "byte" }"#)])),
+        []
+    );
+    for (addressing, byte) in [("element", 16), ("byte", 8), ("openplc", 1040)] {
+        let plc_addressing = [("plc".to_owned(), addressing.to_owned())].into();
+        let wiring = topics(&config, &Neighbours { plc_addressing, ..neighbours(&["plc"]) });
+        assert_eq!((wiring.outputs[0].byte, wiring.inputs[0].byte), (byte, byte), "{addressing}");
+    }
 }
 
 #[test]

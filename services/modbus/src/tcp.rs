@@ -6,7 +6,8 @@
 
 use crate::server::Image;
 use crate::session::{MAX_EXCEPTION, Next, Session, SessionCounts, UnitRule};
-use ipc_types::net::IpFilter;
+use ipc_types::clock;
+use ipc_types::net::{IpFilter, Seldom};
 use serde::{Deserialize, Serialize};
 use std::cell::{Cell, RefCell};
 use std::fmt;
@@ -320,6 +321,7 @@ impl<B: Backend + 'static> Hub<B> {
 
     /// Accepts connections for ever. A failing accept (descriptors, memory) never ends it.
     pub async fn accept(self: Rc<Self>, listener: TcpListener) {
+        let mut seldom = Seldom::default();
         loop {
             match listener.accept().await {
                 Ok((stream, peer)) => self.admit(stream, peer),
@@ -331,7 +333,13 @@ impl<B: Backend + 'static> Hub<B> {
                             | io::ErrorKind::ConnectionReset
                             | io::ErrorKind::Interrupted
                     ) {
-                        tracing::warn!(%error, "accepting a Modbus connection failed; trying again");
+                        if let Some(untold) = seldom.failed(clock::mono_ns()) {
+                            tracing::warn!(
+                                %error,
+                                untold,
+                                "accepting a Modbus connection failed; trying again every 100 ms; told every 10 s"
+                            );
+                        }
                         tokio::time::sleep(ACCEPT_PAUSE).await;
                     }
                 }

@@ -4,11 +4,10 @@
 //! the image, so that a client that reads back sees what it wrote. An overlay ends by the PLC's acknowledgement
 //! (whatever its result), by a new generation of the PLC, or after `stale_after`. Sans-I/O: time and messages come in.
 
-use crate::address::AreaSizes;
 use crate::map::Memory;
 use ipc_types::image_write::{self, Builder, MAX_BYTES};
 use ipc_types::payload::{Image, PlcState, acks};
-use ipc_types::wiring::Area;
+use ipc_types::wiring::{Area, AreaSizes};
 use std::collections::VecDeque;
 
 /// Most writes that may wait for their acknowledgement; as deep as the PLC's queue. Then exception 06.

@@ -1,7 +1,7 @@
 //! Nothing is allocated between a request and its answer, whatever the request is.
 #![allow(unsafe_code)]
 
-use dinrail_modbus::address::{Addressing, AreaSizes};
+use dinrail_iec::Addressing;
 use dinrail_modbus::config::OnStop;
 use dinrail_modbus::map_config::MapConfig;
 use dinrail_modbus::process_image::{NotQueued, ProcessImage, Rail};
@@ -11,6 +11,7 @@ use dinrail_modbus::tcp::Backend;
 use dinrail_modbus::view::View;
 use ipc_types::image_write::Builder;
 use ipc_types::payload::{Image, PlcState};
+use ipc_types::wiring::AreaSizes;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 

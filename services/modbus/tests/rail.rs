@@ -2,20 +2,15 @@
 
 #![allow(clippy::unwrap_used, reason = "helpers of a test, outside #[test] functions")]
 
-use ipc_types::Context;
 use ipc_types::image_write;
 use ipc_types::payload::{Event, Image, ImageWrite, Inputs, PlcState, Status};
-use ipc_types::rail::{
-    CONFIG_FILE, STACK_FILE, config_text, create_inbox, create_topic, join, node, place, port_limits,
-};
-use ipc_types::stack::{ServiceEntry, Stack, TopicEntry, Wake};
+use ipc_types::testing::{TestRail, join, service, topic};
 use ipc_types::topic::{EVENTS, TopicKind};
 use ipc_types::wiring::{Area, Neighbours, Wiring};
 use std::collections::BTreeMap;
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::os::fd::OwnedFd;
-use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant};
 
@@ -151,114 +146,46 @@ fn client(address: SocketAddr, tell: Sender<Tell>) {
     client.tell.send(Tell::Done).unwrap();
 }
 
-fn topic(kind: TopicKind, service: &str, wakes: &[&str]) -> TopicEntry {
-    let row = kind.row();
-    let (max_publishers, max_subscribers) = port_limits(kind, 2, 2);
-    TopicEntry {
-        name: if kind == TopicKind::Events { EVENTS.to_owned() } else { kind.of(service) },
-        kind,
-        depth: row.depth,
-        max_tail: row.max_tail,
-        writers: Vec::new(),
-        readers: Vec::new(),
-        wakes: wakes.iter().map(|name| Wake { service: (*name).to_owned(), event_id: 0 }).collect(),
-        max_publishers,
-        max_subscribers,
-    }
-}
-
-fn stack(root: &Path, prefix: &str) -> Stack {
+fn rail() -> TestRail {
     let config: dinrail_modbus::Config = serde_json::from_str(CONFIG).unwrap();
-    let neighbours = Neighbours {
-        name: "modbus".to_owned(),
-        services: vec![
-            ("plc".to_owned(), "plc".to_owned()),
-            ("modbus".to_owned(), "modbus-server".to_owned()),
+    let services =
+        vec![("plc".to_owned(), "plc".to_owned()), ("modbus".to_owned(), "modbus-server".to_owned())];
+    let neighbours = Neighbours { name: "modbus".to_owned(), services, ..Neighbours::default() };
+    let wiring = dinrail_modbus::topics(&config, &neighbours);
+    TestRail::new(
+        "modbustest",
+        vec![
+            service("plc", "plc", serde_json::json!({}), Wiring::default()),
+            service("modbus", "modbus-server", serde_json::from_str(CONFIG).unwrap(), wiring),
         ],
-        ..Neighbours::default()
-    };
-    let entry = |name: &str, kind: &str, index, config, wiring| ServiceEntry {
-        name: name.to_owned(),
-        kind: kind.to_owned(),
-        index,
-        config,
-        wiring,
-    };
-    let mut topics = vec![
-        topic(TopicKind::Events, "", &[]),
-        topic(TopicKind::Image, "plc", &[]),
-        topic(TopicKind::Writes, "plc", &["plc"]),
-        topic(TopicKind::Inputs, "modbus", &["plc"]),
-    ];
-    for service in ["plc", "modbus"] {
-        topics.push(topic(TopicKind::Health, service, &[]));
-        topics.push(topic(TopicKind::Status, service, &[]));
-    }
-    Stack {
-        name: "modbus-rail-test".to_owned(),
-        file: PathBuf::from("test.toml"),
-        dir: PathBuf::from("."),
-        text: String::new(),
-        build_id: String::new(),
-        root: root.to_owned(),
-        prefix: prefix.to_owned(),
-        services: vec![
-            entry("plc", "plc", 1, serde_json::json!({}), Wiring::default()),
-            entry(
-                "modbus",
-                "modbus-server",
-                2,
-                serde_json::from_str(CONFIG).unwrap(),
-                dinrail_modbus::topics(&config, &neighbours),
-            ),
+        vec![
+            topic(TopicKind::Image, "plc"),
+            topic(TopicKind::Writes, "plc").wakes("plc", 0),
+            topic(TopicKind::Inputs, "modbus").wakes("plc", 0),
         ],
-        topics,
-    }
-}
-
-/// Removes what the rail left in shared memory.
-fn wipe(root: &Path, prefix: &str) {
-    let _ = std::fs::remove_dir_all(root);
-    for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
-        if entry.file_name().to_string_lossy().starts_with(prefix) {
-            let _ = std::fs::remove_file(entry.path());
-        }
-    }
+    )
 }
 
 #[test]
 fn registers_of_a_running_stack() {
-    let (root, prefix) = place(0, &format!("modbus-rail-test-{}", std::process::id()));
-    wipe(&root, &prefix);
-    std::fs::create_dir_all(&root).unwrap();
-    std::fs::write(root.join(CONFIG_FILE), config_text(&root, &prefix)).unwrap();
-    let stack = stack(&root, &prefix);
-    std::fs::write(root.join(STACK_FILE), serde_json::to_string(&stack).unwrap()).unwrap();
-    join(&root).unwrap();
-    let launcher = node("launcher").unwrap();
-    let _topics: Vec<_> = stack.topics.iter().map(|topic| create_topic(&launcher, topic).unwrap()).collect();
-    let _inbox = create_inbox(&launcher, "plc", 4).unwrap();
-
+    let rail = rail();
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap();
-    let service_root = root.clone();
+    let root = rail.root().to_owned();
     // Ends with the process: nothing tells it to stop.
     std::thread::spawn(move || {
         let fds = BTreeMap::from([("tcp".to_owned(), OwnedFd::from(listener))]);
-        let ctx = Context::service(&service_root, "modbus", 1, fds).unwrap();
-        dinrail_modbus::run(ctx).unwrap();
+        dinrail_modbus::run(join(&root, "modbus", fds)).unwrap();
     });
     let (tell, told) = channel();
     let client = std::thread::spawn(move || client(address, tell));
-    play_plc(&root, &told);
-    let result = client.join();
-    wipe(&root, &prefix);
-    result.unwrap();
+    play_plc(&rail, &told);
+    client.join().unwrap();
 }
 
 /// Scans every 2 ms until the client is done or dead.
-fn play_plc(root: &Path, told: &Receiver<Tell>) {
-    let mut ctx = Context::service(root, "plc", 1, BTreeMap::new()).unwrap();
+fn play_plc(rail: &TestRail, told: &Receiver<Tell>) {
+    let mut ctx = rail.context("plc");
     let mut image = ctx.publisher::<Image>("plc/image").unwrap();
     let mut writes = ctx.subscriber::<ImageWrite>("plc/writes").unwrap();
     let mut inputs = ctx.subscriber::<Inputs>("modbus/inputs").unwrap();

@@ -1,7 +1,8 @@
 //! The table of a plc service in the stack file.
 
 use crate::routes::RouteConfig;
-use crate::setup::{AddressingName, ModByZeroName, RealToIntName};
+use crate::setup::{ModByZeroName, RealToIntName};
+use dinrail_iec::Addressing;
 use ipc_types::units::{Size, Span};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -49,7 +50,7 @@ pub struct Config {
     pub input_bytes: Size,
     pub output_bytes: Size,
     pub marker_bytes: Size,
-    pub addressing: AddressingName,
+    pub addressing: Addressing,
     /// Processor time after which a task is killed. Default: 10 periods of the fastest task, 100 ms to 1 s.
     pub watchdog: Option<Span>,
     /// How long the first scan waits for inputs that have not come yet.
@@ -77,7 +78,7 @@ impl Default for Config {
             input_bytes: Size(4096),
             output_bytes: Size(4096),
             marker_bytes: Size(4096),
-            addressing: AddressingName::Element,
+            addressing: Addressing::Element,
             watchdog: None,
             start_timeout: Span::from_ms(1000),
             input_timeout: Span::from_ms(500),

@@ -14,8 +14,8 @@ pub mod retain;
 pub mod routes;
 pub mod service;
 pub mod setup;
+pub mod trace;
+pub mod verify;
 
 pub use config::Config;
 pub use service::{KIND, RunError, check, run, topics};
-pub mod trace;
-pub mod verify;

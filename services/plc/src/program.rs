@@ -3,9 +3,9 @@
 use crate::config::Config;
 use crate::engine::Program;
 use crate::setup::{External, InputRange, Setup};
-use dinrail_iec::{Addressing, Artifact, Source, compile};
+use dinrail_iec::{Addressing, Artifact, LocatedAddress, Source, compile};
 use ipc_types::stack::Stack;
-use ipc_types::wiring::{Area, ImageRange};
+use ipc_types::wiring::ImageRange;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -68,7 +68,12 @@ pub fn compile_sources(sources: Vec<Source>, setup: &Setup) -> Result<Compiled, 
 
 fn read(path: &Path) -> Result<Vec<u8>, ProgramError> {
     let error = |source| ProgramError::Read { path: path.to_owned(), source };
-    if std::fs::metadata(path).map_err(error)?.len() > MAX_FILE_BYTES {
+    let metadata = std::fs::metadata(path).map_err(error)?;
+    // A pipe may never deliver and a device never end.
+    if !metadata.is_file() {
+        return Err(error(std::io::Error::new(std::io::ErrorKind::InvalidInput, "it is no file")));
+    }
+    if metadata.len() > MAX_FILE_BYTES {
         return Err(ProgramError::TooLong { path: path.to_owned() });
     }
     std::fs::read(path).map_err(error)
@@ -102,7 +107,7 @@ pub fn setup(config: &Config, stack: &Stack, me: &str) -> Setup {
             });
         }
         for range in service.wiring.inputs.iter().chain(&service.wiring.outputs) {
-            if let Ok(Some(external)) = external(range, &service.name, config.addressing.into()) {
+            if let Ok(Some(external)) = external(range, &service.name, config.addressing) {
                 setup.externals.push(external);
             }
         }
@@ -131,37 +136,26 @@ pub fn external(range: &ImageRange, owner: &str, addressing: Addressing) -> Resu
 
 /// The `%`-address of a range in the service's way to count.
 pub fn address_text(range: &ImageRange, addressing: Addressing) -> Result<String, String> {
-    let area = range.area.letter();
-    if let Some(bit) = range.bit {
-        return Ok(format!("%{area}X{}.{bit}", range.byte));
-    }
-    let (letter, size, base) = match range.bytes {
-        1 => ('B', 1, 3072),
-        2 => ('W', 2, 1024),
-        4 => ('D', 4, 4096),
-        8 => ('L', 8, 8192),
-        n => return Err(format!("{n} bytes have no %-address")),
-    };
-    let number = match addressing {
-        Addressing::Byte => return Ok(format!("%{area}{letter}{}", range.byte)),
-        Addressing::Element => Some(range.byte),
-        Addressing::OpenPlc => range.byte.checked_sub(base),
-    };
-    match number {
-        Some(byte) if byte % size == 0 => Ok(format!("%{area}{letter}{}", byte / size)),
-        _ => Err(format!(
-            "byte {} of %{area} cannot be named as %{area}{letter}: place it at a multiple of {size}, or set addressing = \"byte\" in the plc",
-            range.byte
-        )),
-    }
+    let (area, byte) = (range.area.letter(), range.byte);
+    let at = LocatedAddress::new(area, byte, range.bit, range.bytes)
+        .ok_or_else(|| format!("{} bytes at byte {byte} of %{area} have no %-address", range.bytes))?;
+    at.text(addressing).ok_or_else(|| {
+        let (letter, size) = (at.size.letter(), at.size.bytes());
+        format!(
+            "byte {byte} of %{area} cannot be named as %{area}{letter}: place it at a multiple of {size}, or set addressing = \"byte\" in the plc"
+        )
+    })
 }
 
-/// All ranges of %Q and %M that neighbours use, for messages.
-pub fn outputs_of<'a>(stack: &'a Stack, me: &'a str) -> impl Iterator<Item = (&'a str, &'a ImageRange)> {
-    stack
-        .services
-        .iter()
-        .filter(move |s| s.wiring.plc.as_deref() == Some(me))
-        .flat_map(|s| s.wiring.outputs.iter().map(|r| (s.name.as_str(), r)))
-        .filter(|(_, r)| r.area != Area::Input)
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_file_is_not_read() {
+        // Reading would take all memory.
+        let Err(error) = read(Path::new("/dev/zero")) else { panic!("a device is no program") };
+        assert_eq!(error.to_string(), "cannot read /dev/zero: it is no file");
+        assert!(matches!(read(Path::new("/")), Err(ProgramError::Read { .. })));
+    }
 }

@@ -147,7 +147,7 @@ fn check_neighbours(config: &Config, stack: &Stack, me: &str, setup: &Setup, fin
                     format!("the quality at %IB{status} lies beyond %I's {} bytes", setup.input_bytes);
                 findings.push(Finding::error(&service.name, &range.key, message, "place it lower"));
             }
-            if let Err(reason) = program::external(range, &service.name, config.addressing.into()) {
+            if let Err(reason) = program::external(range, &service.name, config.addressing) {
                 let name = range.symbol.clone().unwrap_or_default();
                 let message = format!("symbol '{name}': {reason}");
                 findings.push(Finding::error(

@@ -41,7 +41,7 @@ pub struct External {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Setup {
     /// `element`, `byte` or `openplc`.
-    pub addressing: AddressingName,
+    pub addressing: Addressing,
     pub input_bytes: u32,
     pub output_bytes: u32,
     pub marker_bytes: u32,
@@ -65,26 +65,6 @@ pub struct Setup {
     pub files: Vec<String>,
 }
 
-/// Key `addressing`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum AddressingName {
-    #[default]
-    Element,
-    Byte,
-    OpenPlc,
-}
-
-impl From<AddressingName> for Addressing {
-    fn from(name: AddressingName) -> Self {
-        match name {
-            AddressingName::Element => Self::Element,
-            AddressingName::Byte => Self::Byte,
-            AddressingName::OpenPlc => Self::OpenPlc,
-        }
-    }
-}
-
 /// Key `real_to_int`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -106,7 +86,7 @@ pub enum ModByZeroName {
 impl Default for Setup {
     fn default() -> Self {
         Self {
-            addressing: AddressingName::Element,
+            addressing: Addressing::Element,
             input_bytes: 4096,
             output_bytes: 4096,
             marker_bytes: 4096,
@@ -126,7 +106,7 @@ impl Setup {
     /// Options for the compiler.
     pub fn options(&self) -> Options {
         Options {
-            addressing: self.addressing.into(),
+            addressing: self.addressing,
             input_bytes: self.input_bytes,
             output_bytes: self.output_bytes,
             marker_bytes: self.marker_bytes,
@@ -166,7 +146,7 @@ impl Setup {
     pub fn compile_routes(&self, image: &Image) -> Result<Vec<Route>, (usize, RouteError)> {
         let ranges: Vec<(u32, u32)> = self.inputs.iter().map(|r| (r.byte, r.bytes)).collect();
         let plan = RoutePlan {
-            addressing: self.addressing.into(),
+            addressing: self.addressing,
             input: (image.input.offset, image.input.bytes),
             output: (image.output.offset, image.output.bytes),
             marker: (image.marker.offset, image.marker.bytes),

@@ -294,6 +294,7 @@ mod tests {
             name: "rec".into(),
             services: vec![("plc".into(), "plc".into()), ("can0".into(), "can".into())],
             dir: PathBuf::new(),
+            ..Neighbours::default()
         };
         let wiring = topics(&Config::default(), &neighbours);
         assert!(wiring.records && wiring.topics.is_empty() && wiring.reads.is_empty());

@@ -95,7 +95,7 @@ pub(crate) fn chunk_head(record: &[u8]) -> Option<ChunkHead<'_>> {
     let len = usize::try_from(bytes.u64()?).ok()?;
     let from = record.len() - bytes.0.len();
     let fits = len <= bytes.0.len() && uncompressed <= MAX_CHUNK;
-    fits.then_some(ChunkHead { crc, compression, records: (from, from + len) })
+    fits.then(|| ChunkHead { crc, compression, records: (from, from + len) })
 }
 
 pub(crate) fn schema(record: &[u8]) -> Option<(u16, Schema)> {
@@ -152,6 +152,20 @@ mod tests {
     fn the_checksum_is_zlibs() {
         assert_eq!(crc32(b"123456789"), 0xCBF4_3926);
         assert_eq!(crc32(b""), 0);
+    }
+
+    #[test]
+    fn a_chunk_longer_than_memory_is_no_chunk() {
+        let head = |len: u64| {
+            let mut bytes = vec![0; 8 + 8 + 8 + 4 + 4];
+            bytes.extend(len.to_le_bytes());
+            bytes.extend([1, 2, 3]);
+            bytes
+        };
+        assert_eq!(chunk_head(&head(3)).map(|c| c.records), Some((40, 43)));
+        for len in [4, u64::from(u32::MAX), u64::MAX] {
+            assert!(chunk_head(&head(len)).is_none(), "{len}");
+        }
     }
 
     proptest! {

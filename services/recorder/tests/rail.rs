@@ -7,14 +7,14 @@
 
 mod common;
 
-use common::{TempDir, service, topic, wait_for};
+use common::{TempDir, wait_for};
 use dinrail_recorder::reader::Recording;
 use dinrail_recorder::{config, info, replay, scan_contents, service as recorder};
 use ipc_types::payload::{CanFrame, Job, ScanPart};
 use ipc_types::reactor::signals;
-use ipc_types::stack::Stack;
+use ipc_types::testing::{TestRail, service, topic};
 use ipc_types::topic::{EVENTS, TopicKind};
-use ipc_types::{Context, clock, rail};
+use ipc_types::{Context, Wiring, clock};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -25,52 +25,20 @@ use std::time::{Duration, Instant};
 const BUSES: usize = 4;
 const FRAMES_PER_S: u64 = 8000;
 
-/// The root goes with the test, however it ends.
-struct Root(PathBuf, String);
-
-impl Drop for Root {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-        for file in std::fs::read_dir("/dev/shm").unwrap().flatten() {
-            if file.file_name().to_string_lossy().starts_with(&self.1) {
-                let _ = std::fs::remove_file(file.path());
-            }
-        }
-    }
-}
-
-fn make_stack(dir: &Path, root: &Path, prefix: &str) -> Stack {
+fn make_rail(dir: &Path) -> TestRail {
     std::fs::write(dir.join("main.st"), "PROGRAM main END_PROGRAM").unwrap();
-    let mut stack = common::stack(dir);
-    stack.root = root.to_owned();
-    stack.prefix = prefix.to_owned();
-    stack.services.clear();
-    stack.topics.clear();
+    let (mut services, mut topics) = (Vec::new(), Vec::new());
     for bus in 0..BUSES {
         let name = format!("can{bus}");
-        stack.services.push(service(&name, "can", bus as u32 + 1, serde_json::json!({})));
-        stack.topics.push(topic(&TopicKind::CanRx.of(&name), TopicKind::CanRx));
-        stack.topics.push(topic(&TopicKind::CanTx.of(&name), TopicKind::CanTx));
+        topics.extend([topic(TopicKind::CanRx, &name), topic(TopicKind::CanTx, &name)]);
+        services.push(service(&name, "can", serde_json::json!({}), Wiring::default()));
     }
-    let mut plc = service("plc", "plc", 8, serde_json::json!({}));
-    plc.wiring.files = vec![("main.st".into(), "program[0]".into())];
-    stack.services.push(plc);
+    let files = vec![("main.st".into(), "program[0]".into())];
+    services.push(service("plc", "plc", serde_json::json!({}), Wiring { files, ..Wiring::default() }));
     let table = serde_json::json!({ "dir": "recordings", "keep": "1GiB" });
-    stack.services.push(service("rec", "recorder", 9, table));
-    for kind in [TopicKind::Scan, TopicKind::Keyframe, TopicKind::Jobs] {
-        stack.topics.push(topic(&kind.of("plc"), kind));
-    }
-    for s in ["can0", "can1", "can2", "can3", "plc", "rec"] {
-        stack.topics.push(topic(&TopicKind::Health.of(s), TopicKind::Health));
-        stack.topics.push(topic(&TopicKind::Status.of(s), TopicKind::Status));
-    }
-    stack.topics.push(topic(EVENTS, TopicKind::Events));
-    stack
-}
-
-fn write_stack(stack: &Stack) {
-    let text = serde_json::to_string(stack).unwrap();
-    std::fs::write(stack.root.join(rail::STACK_FILE), text).unwrap();
+    services.push(service("rec", "recorder", table, Wiring::default()));
+    topics.extend([TopicKind::Scan, TopicKind::Keyframe, TopicKind::Jobs].map(|kind| topic(kind, "plc")));
+    TestRail::in_folder(dir, "recordertest", services, topics)
 }
 
 fn context(root: &Path, name: &str, generation: u32) -> Context {
@@ -211,7 +179,8 @@ fn check_recording(file: &Path, sent: u64) {
     assert!(falling * 100 <= times.len(), "time order");
 }
 
-fn replayed(root: &Path, stack: &mut Stack, file: &Path, sent: u64) {
+fn replayed(rail: &mut TestRail, file: &Path, sent: u64) {
+    let stack = &mut rail.stack;
     let me = stack.services.iter_mut().find(|s| s.name == "can0").unwrap();
     me.kind = "replay".into();
     me.config = serde_json::json!({ "file": file, "source": "can1/rx", "speed": 1.0 });
@@ -222,7 +191,8 @@ fn replayed(root: &Path, stack: &mut Stack, file: &Path, sent: u64) {
     let wrong = replay::Config { source: Some("can9/rx".into()), ..table.clone() };
     let findings = replay::check(&wrong, &stack_now, &me);
     assert!(findings[0].help.contains("can0/rx, can1/rx"), "{findings:?}");
-    write_stack(stack);
+    rail.rewrite();
+    let root = rail.root();
     let observer = Context::observer(root).unwrap();
     let mut rx = observer.subscriber::<CanFrame>("can0/rx").unwrap();
     let mut events = observer.subscriber::<ipc_types::payload::Event>(EVENTS).unwrap();
@@ -257,27 +227,18 @@ fn replayed(root: &Path, stack: &mut Stack, file: &Path, sent: u64) {
 fn main() {
     // Before any thread: they all inherit the blocked signal.
     let signal = signals::descriptor(&[libc::SIGTERM, libc::SIGINT]).unwrap();
-    let prefix = format!("drt{:x}_", std::process::id());
-    let root = Root(PathBuf::from(format!("/dev/shm/drt{:x}", std::process::id())), prefix.clone());
-    std::fs::create_dir(&root.0).unwrap();
     let dir = TempDir::new("rail");
-    let mut stack = make_stack(dir.path(), &root.0, &prefix);
-    std::fs::write(root.0.join(rail::CONFIG_FILE), rail::config_text(&root.0, &prefix)).unwrap();
-    write_stack(&stack);
-    rail::join(&root.0).unwrap();
-    let node = rail::node("launcher").unwrap();
-    let held: Vec<_> = stack.topics.iter().map(|t| rail::create_topic(&node, t).unwrap()).collect();
-    let me = stack.service("rec").unwrap().clone();
+    let mut rail = make_rail(dir.path());
+    let me = rail.stack.service("rec").unwrap().clone();
     let table: config::Config = serde_json::from_value(me.config.clone()).unwrap();
-    assert_eq!(config::check(&table, &stack, &me), vec![]);
+    assert_eq!(config::check(&table, &rail.stack, &me), vec![]);
 
     let seconds = std::env::var("DINRAIL_RAIL_SECONDS").ok().and_then(|s| s.parse().ok()).unwrap_or(2);
-    let sent = record(&root.0, seconds);
-    let files = recorder::files(&table, &stack);
+    let sent = record(rail.root(), seconds);
+    let files = recorder::files(&table, &rail.stack);
     assert_eq!(files.len(), 1);
     check_recording(&files[0].path, sent);
     assert_eq!(signals::take(&signal), Some(libc::SIGTERM));
-    replayed(&root.0, &mut stack, &files[0].path, sent);
-    drop(held);
+    replayed(&mut rail, &files[0].path, sent);
     println!("rail: ok");
 }

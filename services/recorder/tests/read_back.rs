@@ -10,20 +10,11 @@ use serde_json::{Value, json};
 use std::path::Path;
 use std::process::Command;
 
-/// Path of a python with `mcap` and `mcap-ros1-support`, from DINRAIL_PYTHON.
-fn python() -> Option<String> {
-    let python = std::env::var("DINRAIL_PYTHON").ok().filter(|p| !p.is_empty());
-    if python.is_none() {
-        let forced = std::env::var("DINRAIL_NO_SKIP").is_ok_and(|v| v == "1");
-        assert!(!forced, "DINRAIL_PYTHON is not set and DINRAIL_NO_SKIP=1 forbids to skip");
-        eprintln!(
-            "SKIPPED: set DINRAIL_PYTHON to a python with mcap 1.6.0 and mcap-ros1-support 0.9.0 to run this test"
-        );
-    }
-    python
-}
+#[path = "../../../tests/support/python.rs"]
+mod python;
+use python::python;
 
-fn read_back(python: &str, file: &Path, options: &[&str]) -> Value {
+fn read_back(python: &Path, file: &Path, options: &[&str]) -> Value {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/read_back.py");
     let output = Command::new(python).arg(script).arg(file).args(options).output().unwrap();
     let errors = String::from_utf8_lossy(&output.stderr);

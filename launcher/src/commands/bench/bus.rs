@@ -39,7 +39,7 @@ backend = "virtual"
 #[derive(Default)]
 struct Received {
     frames: u64,
-    /// Counters that were not the one after the last.
+    /// Counters below the one after the last; above it are gaps, which the bus's numbers show as well.
     disorder: u64,
     next: u64,
     first_ns: u64,
@@ -51,7 +51,7 @@ impl Received {
     fn drain(&mut self, rx: &mut Subscriber<CanFrame>) -> bool {
         let taken = rx.drain(8192, |frame, _| {
             let counter = frame.payload().try_into().map_or(u64::MAX, u64::from_le_bytes);
-            self.disorder += u64::from(counter != self.next);
+            self.disorder += u64::from(counter < self.next);
             self.next = counter.wrapping_add(1);
             if self.frames == 0 {
                 self.first_ns = frame.stamp.t_ns;
@@ -143,7 +143,8 @@ fn send(root: &Path, stop: &AtomicBool, tell: &Sender<u64>, left: &Receiver<()>)
                     tx.ring();
                 }
             }
-            Err(SendError::Full(_)) => {
+            // Also "no reader": so it looks until the driver has read for the first time.
+            Err(SendError::Full(_) | SendError::NoReader(_)) => {
                 tx.ring();
                 std::thread::sleep(FULL_PAUSE);
             }

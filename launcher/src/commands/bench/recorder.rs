@@ -111,7 +111,8 @@ impl Bus {
         while self.sent < due {
             match self.tx.send(CanFrame::classic(CAN_ID, &self.sent.to_le_bytes())) {
                 Ok(_) => self.sent += 1,
-                Err(SendError::Full(_)) => {
+                // Also "no reader": so it looks until the driver has read for the first time.
+                Err(SendError::Full(_) | SendError::NoReader(_)) => {
                     self.tx.ring();
                     return Ok(1);
                 }

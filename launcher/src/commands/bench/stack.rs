@@ -202,6 +202,8 @@ impl BenchStack {
 impl Drop for BenchStack {
     fn drop(&mut self) {
         if !self.ended {
+            // The bench failed: what the stack said may tell why.
+            eprintln!("the stack's log ends with:\n{}", self.log_end());
             let _ = self.end(Duration::from_secs(10));
         }
         if !self.ended {

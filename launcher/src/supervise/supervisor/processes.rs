@@ -6,6 +6,7 @@ use super::super::logbook::{self, Line};
 use super::super::policy::{Death, Kill, Notice};
 use super::super::rail_thread::Order;
 use super::{Cleaner, Source, Supervisor};
+use crate::stackfile::free_shared_memory;
 use ipc_types::clock;
 use ipc_types::event::{EventKind, Level};
 use ipc_types::payload::HealthState;
@@ -212,12 +213,19 @@ impl Supervisor {
         } else {
             Err(format!("{exit}: {}", cut(String::from_utf8_lossy(&text).trim(), EPITAPH_BYTES)))
         };
+        if result.is_err() && free_shared_memory().is_some_and(|free| free < ROOM_BYTES) {
+            self.policy.clean_has_no_room(clock::mono_ns());
+            return;
+        }
         if let Err(cause) = &result {
             self.console.err(format!("stack      | == clean-up after dead processes failed: {cause}"));
         }
         self.policy.clean_done(result, clock::mono_ns());
     }
 }
+
+/// Below this /dev/shm counts as full: a node and the ports of a service need about as much.
+const ROOM_BYTES: u64 = 1 << 20;
 
 /// At most so many bytes of a text.
 fn cut(text: &str, bytes: usize) -> String {

@@ -175,11 +175,11 @@ fn parse_stamp(text: &str) -> Result<u64, ParseError> {
         let inner = text.strip_prefix('(')?.strip_suffix(')')?;
         let (seconds, fraction) = inner.split_once('.').unwrap_or((inner, "0"));
         let seconds = hex::decimal(seconds.as_bytes())?;
-        let nine = fraction.get(..9).unwrap_or(fraction);
-        let scale = 10u64.pow(9 - u32::try_from(nine.len()).ok()?);
         if !fraction.bytes().all(|c| c.is_ascii_digit()) {
             return None;
         }
+        let nine = fraction.get(..9).unwrap_or(fraction);
+        let scale = 10u64.pow(9 - u32::try_from(nine.len()).ok()?);
         let fraction_ns = hex::decimal(nine.as_bytes())? * scale;
         seconds.checked_mul(1_000_000_000)?.checked_add(fraction_ns)
     };
@@ -330,6 +330,7 @@ mod tests {
             "1 (1612543138.000000) vcan0 18EF000B#00",
             "(x) can0 123#00",
             "(1.-5) can0 123#00",
+            "(1.00000000é) can0 123#00",
             "(1.0) can0",
             "(1.0) can0 123#00 Q",
             "(99999999999999.0) can0 123#00",
@@ -343,6 +344,7 @@ mod tests {
         stamp `1` must be (SECONDS.FRACTION), for example (1543509533.000838)
         stamp `(x)` must be (SECONDS.FRACTION), for example (1543509533.000838)
         stamp `(1.-5)` must be (SECONDS.FRACTION), for example (1543509533.000838)
+        stamp `(1.00000000é)` must be (SECONDS.FRACTION), for example (1543509533.000838)
         a candump log line is `(SECONDS.FRACTION) BUS ID#DATA`
         a candump log line is `(SECONDS.FRACTION) BUS ID#DATA`
         stamp `(99999999999999.0)` must be (SECONDS.FRACTION), for example (1543509533.000838)

@@ -5,9 +5,14 @@
 
 pub mod busload;
 pub mod candump;
+pub mod cannelloni;
+pub mod error_frame;
 pub mod frame;
 mod hex;
 pub mod slcan;
+pub mod slcan_client;
 pub mod socketcand;
+pub mod socketcand_client;
+pub mod peer;
 
 pub use frame::{Frame, FrameError};

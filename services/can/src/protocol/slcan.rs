@@ -136,7 +136,7 @@ fn single_digit(text: &[u8]) -> Option<u8> {
 }
 
 /// Identifier, data length code, data; text after the data (a stamp) is ignored.
-fn transmit(letter: u8, rest: &[u8]) -> Option<Frame> {
+pub(super) fn transmit(letter: u8, rest: &[u8]) -> Option<Frame> {
     let extended = letter.is_ascii_uppercase();
     let (id_text, rest) = rest.split_at_checked(if extended { 8 } else { 3 })?;
     let id = hex::number(id_text).filter(|&id| id <= if extended { EFF_MASK } else { SFF_MASK })?;

@@ -156,7 +156,7 @@ fn parse(text: &[u8]) -> Command {
 }
 
 /// Identifier in hex: up to 3 digits standard, 4-8 extended (python-can pads to 3 and 8).
-fn identifier(word: &[u8]) -> Option<(u32, bool)> {
+pub(super) fn identifier(word: &[u8]) -> Option<(u32, bool)> {
     let id = hex::number(word)?;
     let extended = word.len() > 3;
     (id <= if extended { EFF_MASK } else { SFF_MASK }).then_some((id, extended))

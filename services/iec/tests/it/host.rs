@@ -90,7 +90,7 @@ impl Host {
         linker.func_wrap("dinrail", "exptf", |x: f32, y: f32| libm::powf(x, y)).unwrap();
         linker
             .func_wrap("dinrail", "brk", |mut c: wasmtime::Caller<'_, Vec<u32>>, id: i32| {
-                c.data_mut().push(id as u32)
+                c.data_mut().push(id as u32);
             })
             .unwrap();
         let instance = linker.instantiate(&mut store, &module).unwrap();

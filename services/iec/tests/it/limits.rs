@@ -75,7 +75,7 @@ fn sizes() {
 fn counts() {
     let symbols = "FUNCTION_BLOCK f VAR a, b, c, d, e : BOOL; END_VAR END_FUNCTION_BLOCK PROGRAM p VAR x : ARRAY [0..99999] OF f; END_VAR END_PROGRAM";
     assert_eq!(errors(symbols), ["E0803"]);
-    let many: Vec<String> = (0..limits::VARIABLES + 1).map(|i| format!("v{i}")).collect();
+    let many: Vec<String> = (0..=limits::VARIABLES).map(|i| format!("v{i}")).collect();
     assert_eq!(errors(&program(&format!("{} : BOOL;", many.join(", ")), "")), ["E0803"]);
     let mut chain = String::from("FUNCTION_BLOCK f0 VAR x : INT; END_VAR END_FUNCTION_BLOCK ");
     for i in 1..100 {

@@ -15,8 +15,8 @@ fn layout_is_in_the_order_of_the_contract() {
     assert_eq!((l.input.offset, l.input.bytes), (256, 4096));
     assert_eq!((l.output.offset, l.marker.offset, l.retain.offset), (256 + 4096, 256 + 8192, 256 + 12288));
     assert_eq!(l.retain.bytes, 16);
-    assert!(l.data.offset >= l.retain.offset + l.retain.bytes && l.data.offset % 8 == 0);
-    assert!(l.temp.offset >= l.data.offset + l.data.bytes && l.temp.offset % 8 == 0);
+    assert!(l.data.offset >= l.retain.offset + l.retain.bytes && l.data.offset.is_multiple_of(8));
+    assert!(l.temp.offset >= l.data.offset + l.data.bytes && l.temp.offset.is_multiple_of(8));
     for s in &h.artifact.map.symbols {
         let area = if s.retain { l.retain } else { l.data };
         assert!(s.offset >= area.offset && s.offset + s.elem.bytes() <= area.offset + area.bytes, "{s:?}");

@@ -299,7 +299,7 @@ impl Engine {
     }
     /// Finds a variable by path or %-address.
     pub fn resolve(&self, path: &str) -> Result<Cell, VarError> {
-        value::resolve(self.map(), &self.image, self.setup.addressing.into(), path)
+        value::resolve(self.map(), &self.image, self.setup.addressing, path)
     }
     /// Names what the layout of RETAIN is: only memory of the same layout may be kept.
     pub fn retain_layout(&self) -> u64 {
@@ -373,7 +373,7 @@ fn without_program(setup: &Setup) -> Parts {
 }
 
 fn single_bit(map: &DebugMap, image: &Image, setup: &Setup, path: &str) -> Option<SingleBit> {
-    let cell = value::resolve(Some(map), image, setup.addressing.into(), path).ok()?;
+    let cell = value::resolve(Some(map), image, setup.addressing, path).ok()?;
     let mask = match cell.storage {
         Storage::Bit(bit) => 1 << bit,
         _ => 0xFF,

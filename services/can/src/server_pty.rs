@@ -1,0 +1,134 @@
+//! SLCAN on a pseudo-terminal, for tools that want a serial port: can-utils' slcand, SavvyCAN, python-can by device.
+//!
+//! The terminal exists as long as the service; a symbolic link of a name of the user's choice leads to it. One client at
+//! a time: who opens it finds a closed channel, as on an adapter that was just plugged in.
+
+use std::io;
+use std::os::fd::{AsFd, OwnedFd};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
+use std::time::Duration;
+
+use rustix::fs::inotify;
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use tokio::io::unix::AsyncFd;
+
+use crate::server::{Host, Hub};
+use crate::virtual_bus::Dialect;
+use crate::wire::port::Port;
+use crate::{sys, watch};
+
+/// What a client that has closed the terminal left behind is used for so long.
+const LAST_WORDS: Duration = Duration::from_millis(50);
+
+/// A pseudo-terminal with its link.
+pub struct Pty {
+    port: Port,
+    /// Held open, so that the terminal survives its clients and keeps its settings.
+    slave: OwnedFd,
+    watch: AsyncFd<OwnedFd>,
+    device: PathBuf,
+    link: PathBuf,
+}
+
+impl Pty {
+    /// Makes a terminal and the link to it. A link that is there is replaced; anything else there is an error.
+    pub fn new(link: &Path) -> io::Result<Self> {
+        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC)?;
+        grantpt(&master)?;
+        unlockpt(&master)?;
+        rustix::fs::fcntl_setfl(&master, rustix::fs::OFlags::NONBLOCK)?;
+        let name = ptsname(&master, Vec::new())?;
+        let device = PathBuf::from(name.to_string_lossy().into_owned());
+        let slave = std::fs::OpenOptions::new()
+            .read(true)
+            .write(true)
+            .custom_flags(libc::O_NOCTTY | libc::O_NONBLOCK | libc::O_CLOEXEC)
+            .open(&device)?;
+        sys::make_raw(slave.as_fd(), None)?;
+        let notify = inotify::init(inotify::CreateFlags::CLOEXEC | inotify::CreateFlags::NONBLOCK)?;
+        let events = inotify::WatchFlags::OPEN | inotify::WatchFlags::CLOSE_WRITE | inotify::WatchFlags::CLOSE_NOWRITE;
+        inotify::add_watch(&notify, &device, events)?;
+        match std::fs::symlink_metadata(link) {
+            Ok(found) if found.file_type().is_symlink() => std::fs::remove_file(link)?,
+            Ok(_) => return Err(io::Error::new(io::ErrorKind::AlreadyExists, "something that is no link is there")),
+            Err(_) => {}
+        }
+        std::os::unix::fs::symlink(&device, link)?;
+        let link = link.to_owned();
+        Ok(Self { port: Port::Tty(watch::both(master)?), slave: slave.into(), watch: watch::readable(notify)?, device, link })
+    }
+
+    /// Serves clients for ever. Must run inside a `LocalSet`.
+    pub async fn serve<H: Host + 'static>(self, hub: Rc<Hub<H>>) -> io::Result<()> {
+        let peer = self.link.display().to_string();
+        let mut open = 0i32;
+        loop {
+            while open <= 0 {
+                open += self.events().await?;
+            }
+            let Some(number) = hub.enter(&peer, Dialect::Slcan) else {
+                tokio::time::sleep(Duration::from_millis(100)).await;
+                continue;
+            };
+            let mut end = Ok(());
+            let mut gone = false;
+            tokio::select! {
+                broken = hub.converse(&self.port, number) => end = broken,
+                events = self.closed(&mut open) => { events?; gone = true; }
+            }
+            if gone {
+                let _ = tokio::time::timeout(LAST_WORDS, hub.converse(&self.port, number)).await;
+            }
+            hub.leave(&peer, number, Dialect::Slcan, end);
+            self.discard();
+        }
+    }
+
+    async fn closed(&self, open: &mut i32) -> io::Result<()> {
+        while *open > 0 {
+            *open += self.events().await?;
+        }
+        Ok(())
+    }
+
+    /// Waits for openings (+1) and closings (-1) and returns their sum.
+    async fn events(&self) -> io::Result<i32> {
+        loop {
+            let mut guard = self.watch.readable().await?;
+            let mut buffer = [std::mem::MaybeUninit::uninit(); 4096];
+            let mut reader = inotify::Reader::new(self.watch.get_ref(), &mut buffer);
+            let mut sum = None;
+            loop {
+                match reader.next() {
+                    Ok(event) => {
+                        let change = if event.events().contains(inotify::ReadFlags::OPEN) { 1 } else { -1 };
+                        *sum.get_or_insert(0) += change;
+                    }
+                    Err(rustix::io::Errno::AGAIN) => break,
+                    Err(rustix::io::Errno::INTR) => {}
+                    Err(e) => return Err(e.into()),
+                }
+            }
+            guard.clear_ready();
+            if let Some(sum) = sum {
+                return Ok(sum);
+            }
+        }
+    }
+
+    /// Throws away what the last client did not read.
+    fn discard(&self) {
+        let mut buffer = [0u8; 4096];
+        while matches!(rustix::io::read(&self.slave, &mut buffer), Ok(n) if n > 0) {}
+    }
+}
+
+impl Drop for Pty {
+    fn drop(&mut self) {
+        if std::fs::read_link(&self.link).is_ok_and(|to| to == self.device) {
+            let _ = std::fs::remove_file(&self.link);
+        }
+    }
+}
