@@ -107,8 +107,7 @@ impl Watch {
     fn start(port: u16) -> Self {
         let stop = Arc::new(AtomicBool::new(false));
         let (refused, answered, exceptions) = (Arc::default(), Arc::default(), Arc::default());
-        let watch =
-            Self { stop: stop.clone(), refused, answered, exceptions, thread: None };
+        let watch = Self { stop: stop.clone(), refused, answered, exceptions, thread: None };
         let (refused, answered, exceptions) =
             (watch.refused.clone(), watch.answered.clone(), watch.exceptions.clone());
         let thread = thread::spawn(move || {
@@ -176,7 +175,11 @@ fn compact(dump: &str) -> String {
 }
 
 fn generations(stack: &Stack) -> BTreeMap<String, u64> {
-    stack.ps().iter().map(|r| (r["service"].as_str().unwrap().to_owned(), r["generation"].as_u64().unwrap())).collect()
+    stack
+        .ps()
+        .iter()
+        .map(|r| (r["service"].as_str().unwrap().to_owned(), r["generation"].as_u64().unwrap()))
+        .collect()
 }
 
 /// How a process dies.
@@ -250,7 +253,12 @@ fn case(victim: &str, way: Way) {
 
     for (name, generation) in generations(&stack) {
         if name != victim {
-            assert_eq!(generation, before[&name], "{name} must not be touched by the death of {victim}\n{}", stack.log());
+            assert_eq!(
+                generation,
+                before[&name],
+                "{name} must not be touched by the death of {victim}\n{}",
+                stack.log()
+            );
         }
     }
     // The launcher holds the listener: whoever connects while the server restarts waits, but is not refused.
@@ -263,7 +271,10 @@ fn case(victim: &str, way: Way) {
     let events = events(&stack);
     // A restart by command is no fault, and what happens while the recorder is away it cannot see.
     assert!(
-        way == Way::Descriptors || events.iter().any(|e| e["service"] == victim && (e["event"] == "died" || e["event"] == "restarting")),
+        way == Way::Descriptors
+            || events
+                .iter()
+                .any(|e| e["service"] == victim && (e["event"] == "died" || e["event"] == "restarting")),
         "the fault is in the recording: {events:#?}"
     );
 }
@@ -355,7 +366,13 @@ fn the_launcher_is_killed_no_orphan_lives_and_the_next_up_runs() {
     assert!(killed.elapsed() < Duration::from_secs(4), "orphans lived for {:?}", killed.elapsed());
     // The same stack again: what the dead launcher left is wiped.
     let file = stack.scratch.0.join("stack.toml");
-    stack.launcher = dinrail().arg("up").arg(&file).stderr(std::process::Stdio::null()).stdout(std::process::Stdio::null()).spawn().unwrap();
+    stack.launcher = dinrail()
+        .arg("up")
+        .arg(&file)
+        .stderr(std::process::Stdio::null())
+        .stdout(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
     stack.wait_ready();
     works(&stack, port);
     assert_eq!(stack.take_down(), 0);

@@ -57,8 +57,12 @@ impl Boxed {
     }
 
     fn ps(&self) -> Vec<Value> {
-        let output = self.inside(&format!("{} ps --json --stack {}", env!("CARGO_BIN_EXE_dinrail"), self.name));
-        serde_json::from_slice::<Value>(&output.stdout).ok().and_then(|v| v.as_array().cloned()).unwrap_or_default()
+        let output =
+            self.inside(&format!("{} ps --json --stack {}", env!("CARGO_BIN_EXE_dinrail"), self.name));
+        serde_json::from_slice::<Value>(&output.stdout)
+            .ok()
+            .and_then(|v| v.as_array().cloned())
+            .unwrap_or_default()
     }
 
     fn row(&self, service: &str) -> Option<Value> {
@@ -75,14 +79,17 @@ impl Boxed {
     fn wait_ready(&self) {
         self.wait("all ready", || {
             let rows = self.ps();
-            (!rows.is_empty() && rows.iter().all(|r| r["health"] == "ready" && r["state"] == "running")).then_some(())
+            (!rows.is_empty() && rows.iter().all(|r| r["health"] == "ready" && r["state"] == "running"))
+                .then_some(())
         });
     }
 
     fn end(mut self) -> i32 {
         let pid = rustix::process::Pid::from_child(&self.child);
         rustix::process::kill_process(pid, rustix::process::Signal::TERM).unwrap();
-        wait_for("the launcher ends", Duration::from_secs(20), || self.child.try_wait().unwrap()).code().unwrap_or(-1)
+        wait_for("the launcher ends", Duration::from_secs(20), || self.child.try_wait().unwrap())
+            .code()
+            .unwrap_or(-1)
     }
 }
 
@@ -163,7 +170,8 @@ fn register(port: u16) -> Option<u16> {
 fn a_stack_that_needs_more_than_half_of_dev_shm_is_refused() {
     let mounts = "mount -t tmpfs -o size=8m tmpfs /dev/shm";
     let Some(mut boxed) = Boxed::up("shmsmall", mounts, &text(free_port(), "")) else { return };
-    let code = wait_for("the launcher ends", Duration::from_secs(20), || boxed.child.try_wait().unwrap()).code();
+    let code =
+        wait_for("the launcher ends", Duration::from_secs(20), || boxed.child.try_wait().unwrap()).code();
     assert_eq!(code, Some(1));
     let said = boxed.log();
     for part in ["shared memory", "/dev/shm", "MiB"] {
@@ -218,7 +226,10 @@ fn a_full_disk_stops_the_recording_with_path_and_remedy_and_nothing_else() {
     boxed.inside(&format!("rm {}", fill.display()));
     let files = || {
         let list = boxed.inside(&format!("ls {}", fill.with_file_name("").display()));
-        String::from_utf8_lossy(&list.stdout).lines().filter(|l| Path::new(l).extension().is_some_and(|e| e == "mcap")).count()
+        String::from_utf8_lossy(&list.stdout)
+            .lines()
+            .filter(|l| Path::new(l).extension().is_some_and(|e| e == "mcap"))
+            .count()
     };
     boxed.wait("a new file is begun", || (files() >= 2).then_some(()));
     // Data was lost, and that is said.

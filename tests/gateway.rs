@@ -96,7 +96,8 @@ fn expected_registers(frames: &[String]) -> Vec<u16> {
     let mut last: HashMap<&str, Vec<u8>> = HashMap::new();
     for frame in frames {
         let (id, data) = frame.split_once('#').unwrap();
-        let bytes = (0..data.len() / 2).map(|i| u8::from_str_radix(&data[2 * i..2 * i + 2], 16).unwrap()).collect();
+        let bytes =
+            (0..data.len() / 2).map(|i| u8::from_str_radix(&data[2 * i..2 * i + 2], 16).unwrap()).collect();
         last.insert(id, bytes);
     }
     let steer = u16::from_le_bytes([last["102"][0], last["102"][1]]);
@@ -126,8 +127,12 @@ fn a_real_car_is_decoded_by_the_program_read_by_modbus_and_recorded_frame_by_fra
     let Some(mut player) = peers::peer("play_candump.py") else { return };
 
     let mut stack = Stack::up("car", &stack_text(can_port, modbus_port), &[("car.st", PROGRAM)]);
-    let played =
-        player.args(["127.0.0.1", &can_port.to_string(), "can0"]).arg(&log_path).arg("4000").output().unwrap();
+    let played = player
+        .args(["127.0.0.1", &can_port.to_string(), "can0"])
+        .arg(&log_path)
+        .arg("4000")
+        .output()
+        .unwrap();
     assert!(played.status.success(), "{}", String::from_utf8_lossy(&played.stderr));
     assert_eq!(String::from_utf8_lossy(&played.stdout).trim(), "12974");
 
@@ -143,7 +148,21 @@ fn a_real_car_is_decoded_by_the_program_read_by_modbus_and_recorded_frame_by_fra
     });
     if let Some(mut mbpoll) = peers::program("mbpoll", "mbpoll") {
         let output = mbpoll
-            .args(["-m", "tcp", "-p", &modbus_port.to_string(), "-0", "-r", "0", "-c", "2", "-t", "4", "-1", "127.0.0.1"])
+            .args([
+                "-m",
+                "tcp",
+                "-p",
+                &modbus_port.to_string(),
+                "-0",
+                "-r",
+                "0",
+                "-c",
+                "2",
+                "-t",
+                "4",
+                "-1",
+                "127.0.0.1",
+            ])
             .output()
             .unwrap();
         let text = String::from_utf8_lossy(&output.stdout).into_owned();
@@ -152,7 +171,8 @@ fn a_real_car_is_decoded_by_the_program_read_by_modbus_and_recorded_frame_by_fra
     }
 
     assert_eq!(stack.take_down(), 0, "{}", stack.log());
-    let recorded = peers::peer("frames_of.py").unwrap().arg("can0/rx").args(stack.recordings()).output().unwrap();
+    let recorded =
+        peers::peer("frames_of.py").unwrap().arg("can0/rx").args(stack.recordings()).output().unwrap();
     assert!(recorded.status.success(), "{}", String::from_utf8_lossy(&recorded.stderr));
     let recorded: Vec<_> = String::from_utf8(recorded.stdout).unwrap().lines().map(str::to_owned).collect();
     assert_eq!(recorded.len(), frames.len(), "every frame is in the recording");

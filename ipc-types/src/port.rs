@@ -19,7 +19,9 @@ use std::rc::Rc;
 pub enum SendError {
     #[error("topic '{0}': the reader's queue is full; the message was refused, send it later or less often")]
     Full(String),
-    #[error("topic '{0}': nobody reads it now; its consumer is down or restarting")]
+    #[error(
+        "topic '{0}': nobody reads it now; its consumer is down, restarting, or has not connected yet: try again"
+    )]
     NoReader(String),
     #[error("topic '{topic}': a tail of {bytes} bytes is above the limit of {limit}")]
     TooLong { topic: String, bytes: usize, limit: u32 },

@@ -185,7 +185,8 @@ impl Stack {
     pub fn wait_ready(&self) {
         self.wait("all services ready", || {
             let rows = self.ps();
-            (!rows.is_empty() && rows.iter().all(|row| row["health"] == "ready" && row["state"] == "running")).then_some(())
+            (!rows.is_empty() && rows.iter().all(|row| row["health"] == "ready" && row["state"] == "running"))
+                .then_some(())
         });
     }
 
@@ -193,7 +194,10 @@ impl Stack {
     pub fn wait_generation_above(&self, name: &str, generation: u64) {
         self.wait(&format!("{name} back at work after generation {generation}"), || {
             let row = self.service(name)?;
-            (row["generation"].as_u64()? > generation && row["health"] == "ready" && row["state"] == "running").then_some(())
+            (row["generation"].as_u64()? > generation
+                && row["health"] == "ready"
+                && row["state"] == "running")
+                .then_some(())
         });
     }
 
@@ -265,9 +269,8 @@ impl Stack {
 }
 
 pub fn recordings_in(dir: &Path) -> Vec<PathBuf> {
-    let mut files: Vec<_> = fs::read_dir(dir)
-        .map(|entries| entries.flatten().map(|e| e.path()).collect())
-        .unwrap_or_default();
+    let mut files: Vec<_> =
+        fs::read_dir(dir).map(|entries| entries.flatten().map(|e| e.path()).collect()).unwrap_or_default();
     files.retain(|f| f.extension().is_some_and(|e| e == "mcap"));
     files.sort();
     files

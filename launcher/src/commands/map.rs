@@ -349,6 +349,32 @@ mod tests {
     }
 
     #[test]
+    fn addresses_of_every_service_count_as_in_the_plc() {
+        let folder = Folder::new("map-addressing");
+        let text = STACK
+            .replace("kind = \"plc\"", "kind = \"plc\"\naddressing = \"byte\"")
+            .replace("%IW0", "%IW2")
+            .replace("%QW0", "%QW2");
+        let map = "\n[[service.map]]\ntable = \"holding\"\nat = 7\ncount = 1\narea = \"%QW2\"\n";
+        let at = text.find("\n[[service]]\nname = \"rec\"").unwrap();
+        let loaded = folder.load(&format!("{}{map}{}", &text[..at], &text[at..])).unwrap();
+        let (points, servers) = collect(&loaded.stack).unwrap();
+        let shown: Vec<_> = points
+            .iter()
+            .map(|p| (p.service.as_str(), p.element.as_deref(), p.byte.as_deref(), p.modbus.len()))
+            .collect();
+        for point in [
+            ("io", Some("%IW1"), Some("%IW2"), 0),
+            ("io", Some("%QW1"), Some("%QW2"), 1),
+            ("plc", None, Some("%MW1"), 0),
+        ] {
+            assert!(shown.contains(&point), "{point:?} in {shown:?}");
+        }
+        let range = &servers[0].ranges[0];
+        assert_eq!((range.first, range.first_address.as_str()), (7, "%QW1"));
+    }
+
+    #[test]
     fn without_a_server_the_default_map_is_shown() {
         let folder = Folder::new("map-default");
         let at = STACK.find("[[service]]\nname = \"modbus\"").unwrap();

@@ -40,8 +40,10 @@ fn hidden(kind: &str, path: &str) -> Option<(usize, Ask)> {
     let list: &[(&str, &str, Ask)] = &[
         ("can", "serve.socketcand.filter", error_of::<IpFilter>),
         ("can", "serve.slcan.filter", error_of::<IpFilter>),
+        ("can", "serve.cannelloni.filter", error_of::<IpFilter>),
         ("can", "serve.socketcand", error_of::<dinrail_can::config::EndpointTable>),
         ("can", "serve.slcan", error_of::<dinrail_can::config::EndpointTable>),
+        ("can", "serve.cannelloni", error_of::<dinrail_can::config::EndpointTable>),
         ("can-io", "out[].on_stop", error_of::<dinrail_can_io::config::StopValues>),
     ];
     let starts = |p: &str| path == p || path.strip_prefix(p).is_some_and(|r| r.starts_with(['.', '[']));

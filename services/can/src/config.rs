@@ -66,8 +66,8 @@ pub struct Config {
     #[serde(default = "default_true")]
     pub configure: bool,
     /// First pause before the restart after bus-off, up to 60s; 0 = never. Default 100ms.
-    #[serde(default = "default_restart")]
-    pub restart: Span,
+    #[serde(default = "default_bus_off_restart")]
+    pub bus_off_restart: Span,
     /// Receive buffer of the socket, 64KiB - 64MiB. Default 4MiB: about 5,000 frames.
     #[serde(default = "default_rx_buffer")]
     pub rx_buffer: Size,
@@ -212,7 +212,7 @@ fn default_client_buffer() -> Size {
 fn default_max_clients() -> u32 {
     8
 }
-fn default_restart() -> Span {
+fn default_bus_off_restart() -> Span {
     Span::from_ms(100)
 }
 fn default_rx_buffer() -> Size {
@@ -255,7 +255,7 @@ impl Config {
             bitrate: self.bitrate.0,
             data_bitrate: self.data_bitrate.0,
             fd: self.fd,
-            restart_ms: (self.restart.ns() / 1_000_000) as u32,
+            restart_ms: (self.bus_off_restart.ns() / 1_000_000) as u32,
             configure: self.configure,
         }
     }
@@ -270,7 +270,7 @@ impl Config {
             rate_code: slcan_client::rate_code(self.bitrate.0)?,
             data_rate_code,
             timestamps: self.timestamps,
-            restart_ns: self.restart.ns(),
+            restart_ns: self.bus_off_restart.ns(),
         })
     }
 
@@ -282,7 +282,9 @@ impl Config {
             (Some(rest), Backend::Slcan) => address(rest).map(|a| (Target::Tcp(a), None)),
             (Some(rest), Backend::Socketcand) => {
                 let (host, bus) = rest.split_once('/')?;
-                let named = !bus.is_empty() && bus.len() <= 16 && bus.bytes().all(|c| c.is_ascii_graphic() && c != b'/');
+                let named = !bus.is_empty()
+                    && bus.len() <= 16
+                    && bus.bytes().all(|c| c.is_ascii_graphic() && c != b'/');
                 let named = named && !bus.contains(['<', '>']);
                 Some((Target::Tcp(address(host)?), named.then(|| bus.to_owned())))
             }
@@ -351,8 +353,13 @@ impl Config {
         let mut error = |key: &str, message: String, help: &str| {
             found.push(Finding::error(service, key, message, help));
         };
-        if self.restart.ns() > 60_000_000_000 || !self.restart.ns().is_multiple_of(1_000_000) {
-            error("restart", format!("restart {} is out of range", self.restart), "use whole ms up to 60s; 0 = never");
+        if self.bus_off_restart.ns() > 60_000_000_000 || !self.bus_off_restart.ns().is_multiple_of(1_000_000)
+        {
+            error(
+                "bus_off_restart",
+                format!("bus_off_restart {} is out of range", self.bus_off_restart),
+                "use whole ms up to 60s; 0 = never",
+            );
         }
         if !(64 << 10..=64 << 20).contains(&self.rx_buffer.0) {
             error("rx_buffer", format!("rx_buffer {} is out of range", self.rx_buffer), "use 64KiB to 64MiB");
@@ -415,7 +422,11 @@ impl Config {
             );
         }
         if !BAUDS.iter().any(|(rate, _)| *rate == self.baud) {
-            error("baud", format!("a serial port has no rate {}", self.baud), "use e.g. 115200, 921600, 1000000 or 3000000");
+            error(
+                "baud",
+                format!("a serial port has no rate {}", self.baud),
+                "use e.g. 115200, 921600, 1000000 or 3000000",
+            );
         }
     }
 
@@ -547,14 +558,20 @@ mod tests {
     fn mistakes() {
         let all = [
             said(json!({ "backend": "socketcan" })),
-            said(json!({ "backend": "socketcan", "interface": "/dev/ttyACM0", "restart": "2min", "rx_buffer": "1KiB" })),
+            said(
+                json!({ "backend": "socketcan", "interface": "/dev/ttyACM0", "bus_off_restart": "2min", "rx_buffer": "1KiB" }),
+            ),
             said(json!({ "backend": "socketcan", "interface": "nocan42" })),
-            said(json!({ "backend": "slcan", "bitrate": "33k", "baud": 115201, "fd": true, "data_bitrate": "2500k" })),
+            said(
+                json!({ "backend": "slcan", "bitrate": "33k", "baud": 115201, "fd": true, "data_bitrate": "2500k" }),
+            ),
             said(json!({ "backend": "slcan", "interface": "tcp://adapter" })),
             said(json!({ "backend": "socketcand" })),
             said(json!({ "backend": "socketcand", "interface": "tcp://10.0.0.1:29536" })),
             said(json!({ "backend": "socketcand", "interface": "tcp://10.0.0.1:29536/can0" })),
-            said(json!({ "backend": "slcan", "interface": "/dev/ttyACM0", "fd": true, "data_bitrate": "5M" })),
+            said(
+                json!({ "backend": "slcan", "interface": "/dev/ttyACM0", "fd": true, "data_bitrate": "5M" }),
+            ),
             said(
                 json!({ "backend": "virtual", "interface": "can0", "bitrate": "2M", "max_rate": 5, "tx_queue": 0, "client_buffer": "1KiB" }),
             ),
@@ -565,6 +582,20 @@ mod tests {
             said(json!({ "backend": "virtual", "feed": { "file": "no.log", "speed": 0, "gap": "1us" } })),
         ];
         insta::assert_snapshot!(all.join("\n"), @r#"
+        Error interface: backend "socketcan" needs the name of a network interface -> add interface = "can0"; `ip -brief link` lists what there is
+        Error bus_off_restart: bus_off_restart 2min is out of range -> use whole ms up to 60s; 0 = never
+        Error rx_buffer: rx_buffer 1KiB is out of range -> use 64KiB to 64MiB
+        Error interface: '/dev/ttyACM0' is no name of a network interface -> write e.g. "can0"; for a serial device use backend = "slcan"
+        Warning interface: this machine has no interface 'nocan42' now -> the driver waits for it; `ip -brief link` lists what there is
+        Error interface: backend "slcan" needs a serial device or an address -> write e.g. interface = "/dev/ttyACM0" or "tcp://192.168.1.7:3333"; `ls /dev/serial/by-id` lists serial adapters
+        Error bitrate: the SLCAN protocol has no bit rate 33k -> use 10k, 20k, 50k, 83300, 100k, 125k, 250k, 500k, 750k, 800k or 1M
+        Error data_bitrate: the SLCAN protocol has no data bit rate 2500k -> use 1M to 8M in whole M; most adapters have 2M and 5M
+        Error baud: a serial port has no rate 115201 -> use e.g. 115200, 921600, 1000000 or 3000000
+        Error interface: backend "slcan" needs a serial device or an address -> write e.g. interface = "/dev/ttyACM0" or "tcp://192.168.1.7:3333"; `ls /dev/serial/by-id` lists serial adapters
+        Error interface: backend "socketcand" needs the address of a server and its bus -> write e.g. interface = "tcp://192.168.1.7:29536/can0"
+        Error interface: backend "socketcand" needs the address of a server and its bus -> write e.g. interface = "tcp://192.168.1.7:29536/can0"
+
+
         Error bitrate: bitrate 2M is not possible on CAN -> use 5k to 1M
         Error max_rate: max_rate 5 is out of range -> use 100 to 10000000 frames/s
         Error tx_queue: tx_queue 0 is out of range -> use 1 to 4096

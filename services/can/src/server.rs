@@ -169,7 +169,11 @@ impl<H: Host + 'static> Hub<H> {
         known
             .filter_map(|(number, peer)| {
                 let (peer, protocol) = peer.as_ref()?;
-                Some(ClientStatus { peer: peer.clone(), protocol: *protocol, counters: inner.bus.client_counters(number)? })
+                Some(ClientStatus {
+                    peer: peer.clone(),
+                    protocol: *protocol,
+                    counters: inner.bus.client_counters(number)?,
+                })
             })
             .collect()
     }

@@ -48,16 +48,28 @@ impl Pty {
             .open(&device)?;
         sys::make_raw(slave.as_fd(), None)?;
         let notify = inotify::init(inotify::CreateFlags::CLOEXEC | inotify::CreateFlags::NONBLOCK)?;
-        let events = inotify::WatchFlags::OPEN | inotify::WatchFlags::CLOSE_WRITE | inotify::WatchFlags::CLOSE_NOWRITE;
+        let events =
+            inotify::WatchFlags::OPEN | inotify::WatchFlags::CLOSE_WRITE | inotify::WatchFlags::CLOSE_NOWRITE;
         inotify::add_watch(&notify, &device, events)?;
         match std::fs::symlink_metadata(link) {
             Ok(found) if found.file_type().is_symlink() => std::fs::remove_file(link)?,
-            Ok(_) => return Err(io::Error::new(io::ErrorKind::AlreadyExists, "something that is no link is there")),
+            Ok(_) => {
+                return Err(io::Error::new(
+                    io::ErrorKind::AlreadyExists,
+                    "something that is no link is there",
+                ));
+            }
             Err(_) => {}
         }
         std::os::unix::fs::symlink(&device, link)?;
         let link = link.to_owned();
-        Ok(Self { port: Port::Tty(watch::both(master)?), slave: slave.into(), watch: watch::readable(notify)?, device, link })
+        Ok(Self {
+            port: Port::Tty(watch::both(master)?),
+            slave: slave.into(),
+            watch: watch::readable(notify)?,
+            device,
+            link,
+        })
     }
 
     /// Serves clients for ever. Must run inside a `LocalSet`.

@@ -22,8 +22,8 @@ use crate::config::{Backend, Config};
 use crate::feed::{FeedError, Log, Player};
 use crate::protocol::Frame;
 use crate::server::{ClientStatus, Host, Hub};
-use crate::txqueue::{Pushed, TxCounters};
 use crate::server_pty::Pty;
+use crate::txqueue::{Pushed, TxCounters};
 use crate::virtual_bus::{BusCounters, Origin, Tap, VirtualBus, WireCounters};
 use crate::wire::{Line, LinkStatus, remote, socketcan};
 use crate::{protocol, watch};
@@ -196,7 +196,8 @@ impl Rail {
             self.ctx.event(EventKind::Client, Level::Warning, message, serde_json::Value::Null);
         }
         if self.link_left_out > 0 {
-            let message = format!("{} more events of the wire in the last second left out", self.link_left_out);
+            let message =
+                format!("{} more events of the wire in the last second left out", self.link_left_out);
             self.ctx.event(EventKind::BusState, Level::Warning, message, serde_json::Value::Null);
         }
         self.event_budget = CLIENT_EVENTS;
@@ -331,7 +332,29 @@ async fn serve(mut ctx: Context, config: &Config) -> Result<(), RunError> {
     publish_status(&hub, config, &link);
     // Starts the feed.
     hub.turn(|_, _, _| ());
-    work(&hub, config, &link, &mut inbox, &inbox_fd, &shutdown).await
+    work(&hub, config, &link, &mut inbox, &inbox_fd, &shutdown).await?;
+    sum_up(&hub, &link);
+    Ok(())
+}
+
+/// The counters of the wire in the log, where they outlive the process.
+fn sum_up(hub: &Hub<Rail>, link: &Shared) {
+    let (Some(link), Some(wire)) = (link, hub.look(|bus, _| bus.wire_counters())) else { return };
+    let link = link.borrow();
+    tracing::info!(
+        "{} in all: {} frames sent, {} received, {} error frames, {} dropped by the kernel, {} lost, {} stale, {} unfit; {} times bus-off, {} restarts, {} times down",
+        link.interface,
+        wire.sent,
+        wire.received,
+        wire.errors,
+        link.kernel_drops,
+        wire.lost,
+        wire.stale,
+        wire.unfit,
+        link.bus_off,
+        link.restarts,
+        link.downs
+    );
 }
 
 /// Puts the wire behind the bus that the stack file asks for and starts its task.
@@ -345,7 +368,8 @@ fn attach(hub: &Rc<Hub<Rail>>, config: &Config) -> Result<Shared, RunError> {
         Backend::Virtual => return Ok(None),
         Backend::Socketcan => {
             flight(socketcan::FLIGHT);
-            let settings = socketcan::Settings { wanted: config.wanted(), rx_buffer: config.rx_buffer.0 as usize };
+            let settings =
+                socketcan::Settings { wanted: config.wanted(), rx_buffer: config.rx_buffer.0 as usize };
             tokio::task::spawn_local(socketcan::drive(line, settings));
         }
         Backend::Slcan | Backend::Socketcand => {
@@ -373,6 +397,8 @@ async fn work(
     let mut beat = tokio::time::interval(BEAT);
     beat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     let mut beats = 0u32;
+    // The rail has more frames than one turn takes.
+    let mut more = false;
     loop {
         tokio::select! {
             end = shutdown.readable() => {
@@ -383,9 +409,11 @@ async fn work(
                 let mut guard = rang.map_err(system("waiting for the rail"))?;
                 inbox.drain();
                 guard.clear_ready();
-                while hub.turn(|bus, rail, now_ns| rail.take_tx(bus, now_ns)) {
-                    tokio::task::yield_now().await;
-                }
+                more = true;
+            }
+            // One turn at a time, so that writers that never pause keep neither the heartbeat nor the end waiting.
+            () = tokio::task::yield_now(), if more => {
+                more = hub.turn(|bus, rail, now_ns| rail.take_tx(bus, now_ns));
             }
             due = hub.alarm() => {
                 due.map_err(system("waiting for the clock of the bus"))?;

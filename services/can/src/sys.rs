@@ -136,7 +136,8 @@ fn control(header: &libc::msghdr) -> (Option<u64>, Option<u32>) {
             if head.cmsg_level == libc::SOL_SOCKET {
                 if head.cmsg_type == libc::SCM_TIMESTAMPNS && len >= size_of::<libc::timespec>() {
                     let t = std::ptr::read_unaligned(data.cast::<libc::timespec>());
-                    utc_ns = Some((t.tv_sec as u64).wrapping_mul(1_000_000_000).wrapping_add(t.tv_nsec as u64));
+                    utc_ns =
+                        Some((t.tv_sec as u64).wrapping_mul(1_000_000_000).wrapping_add(t.tv_nsec as u64));
                 } else if head.cmsg_type == libc::SO_RXQ_OVFL && len >= 4 {
                     drops = Some(std::ptr::read_unaligned(data.cast::<u32>()));
                 }
@@ -222,7 +223,8 @@ mod tests {
         }
         a.send(b"no frame").unwrap();
         let mut batch = Batch::default();
-        let got: Vec<_> = receive(b.as_fd(), &mut batch).unwrap().iter().map(|r| (r.frame, r.own, r.drops)).collect();
+        let got: Vec<_> =
+            receive(b.as_fd(), &mut batch).unwrap().iter().map(|r| (r.frame, r.own, r.drops)).collect();
         assert_eq!(got, frames.iter().map(|f| (*f, false, None)).collect::<Vec<_>>());
         assert_eq!(receive(b.as_fd(), &mut batch).unwrap_err().kind(), io::ErrorKind::WouldBlock);
     }

@@ -18,8 +18,8 @@ use crate::protocol::{Frame, cannelloni, slcan, socketcand};
 use crate::txqueue::{Pushed, TxCounters, TxQueue};
 
 mod wire_side;
-pub use wire_side::{STALE_NS, WireCounters};
 use wire_side::WireSide;
+pub use wire_side::{STALE_NS, WireCounters};
 
 /// Most clients of one bus.
 pub const MAX_CLIENTS: usize = 32;

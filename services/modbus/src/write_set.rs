@@ -4,8 +4,8 @@
 //! has `and = 0`, a coil keeps its neighbours by `and`, function 22 brings its own masks. So one request of any
 //! kind is one list that is applied whole.
 
-use ipc_types::wiring::Area;
 use ipc_types::image_write::{Builder, Op, WriteError};
+use ipc_types::wiring::Area;
 
 /// Most bytes one request touches: 123 registers, or 1968 coils from the middle of a byte (247 bytes).
 pub const MAX_BYTES: usize = 248;

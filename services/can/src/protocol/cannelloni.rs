@@ -126,10 +126,11 @@ impl Decoder {
     }
 }
 
-/// Writes a frame and returns its length.
+/// Writes a frame and returns its length. A remote frame goes with length 0: clients differ in whether data follow a
+/// length there (can-cannelloni 0.1.0 waits for them), and without a length they agree.
 pub fn encode(frame: &Frame, out: &mut [u8; MAX_BYTES]) -> usize {
     out[..4].copy_from_slice(&frame.can_id.to_be_bytes());
-    out[4] = frame.len.min(64);
+    out[4] = if frame.is_remote() { 0 } else { frame.len.min(64) };
     let mut n = 5;
     if frame.is_fd() {
         out[4] |= FD;
@@ -161,7 +162,7 @@ mod tests {
         let table: [(Frame, &[u8]); 5] = [
             (Frame::data(0x123, false, &[1, 2]).unwrap(), &[0, 0, 1, 0x23, 2, 1, 2]),
             (Frame::data(0x1ABC_DEF0, true, &[]).unwrap(), &[0x9A, 0xBC, 0xDE, 0xF0, 0]),
-            (Frame::remote(0x123, false, 4).unwrap(), &[0x40, 0, 1, 0x23, 4]),
+            (Frame::remote(0x123, false, 0).unwrap(), &[0x40, 0, 1, 0x23, 0]),
             (Frame::fd(1, false, FD_BRS, &[9]).unwrap(), &[0, 0, 0, 1, 0x81, 5, 9]),
             (Frame::fd(1, false, 0, &[]).unwrap(), &[0, 0, 0, 1, 0x80, 4]),
         ];
@@ -171,6 +172,15 @@ mod tests {
             assert_eq!(&out[..n], bytes);
             assert_eq!(all(&[GREETING, bytes].concat()), [Item::Greeted, Item::Frame(frame)]);
         }
+    }
+
+    #[test]
+    fn a_remote_frame_with_a_length_is_read_and_written_without() {
+        let frame = Frame::remote(0x123, false, 4).unwrap();
+        let mut out = [0; MAX_BYTES];
+        let n = encode(&frame, &mut out);
+        assert_eq!(&out[..n], [0x40, 0, 1, 0x23, 0]);
+        assert_eq!(all(b"CANNELLONIv1\x40\0\x01\x23\x04"), [Item::Greeted, Item::Frame(frame)]);
     }
 
     #[test]
@@ -208,7 +218,11 @@ mod tests {
                     got.push(item);
                 }
             }
-            let expected: Vec<_> = std::iter::once(Item::Greeted).chain(frames.into_iter().map(Item::Frame)).collect();
+            let without_length = |mut f: Frame| {
+                f.len = if f.is_remote() { 0 } else { f.len };
+                Item::Frame(f)
+            };
+            let expected: Vec<_> = std::iter::once(Item::Greeted).chain(frames.into_iter().map(without_length)).collect();
             prop_assert_eq!(got, expected);
         }
 

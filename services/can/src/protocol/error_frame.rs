@@ -236,7 +236,10 @@ mod tests {
             ("20000204#0020000000008000", "error passive by transmit errors; TEC 128, REC 0"),
             ("20000004#000400000000005F", "error warning by receive errors; TEC 0, REC 95"),
             ("20000004#0000000000000000", "controller problem"),
-            ("200000A8#0000801900000000", "while sending; in the acknowledge slot; no acknowledgement; bus error"),
+            (
+                "200000A8#0000801900000000",
+                "while sending; in the acknowledge slot; no acknowledgement; bus error",
+            ),
             ("20000002#0500000000000000", "lost arbitration in bit 5"),
             ("20000010#0000000007000000", "transceiver: CANH shorted to ground"),
             ("20000001#0000000000000000", "transmission timed out"),
@@ -263,7 +266,12 @@ mod tests {
         let by_counters = [(0, 95), (96, 0), (0, 127), (128, 0), (255, 0), (256, 0), (0, 300)];
         let states = by_counters.map(|(tec, rec)| ControllerState::of_counters(tec, rec).words());
         let expected = [
-            "error active", "error warning", "error warning", "error passive", "error passive", "bus-off",
+            "error active",
+            "error warning",
+            "error warning",
+            "error passive",
+            "error passive",
+            "bus-off",
             "error passive",
         ];
         assert_eq!(states, expected);

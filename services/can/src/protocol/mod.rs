@@ -9,10 +9,10 @@ pub mod cannelloni;
 pub mod error_frame;
 pub mod frame;
 mod hex;
+pub mod peer;
 pub mod slcan;
 pub mod slcan_client;
 pub mod socketcand;
 pub mod socketcand_client;
-pub mod peer;
 
 pub use frame::{Frame, FrameError};

@@ -281,19 +281,33 @@ impl Client {
     }
 
     /// The present step is answered (`Some(positive)`) or not (`None`).
-    fn advance(&mut self, step: Step, answer: Option<bool>, now_ns: u64, out: &mut Vec<u8>, heard: &mut dyn FnMut(Heard)) {
+    fn advance(
+        &mut self,
+        step: Step,
+        answer: Option<bool>,
+        now_ns: u64,
+        out: &mut Vec<u8>,
+        heard: &mut dyn FnMut(Heard),
+    ) {
         self.answered_setup |= answer.is_some();
         if answer == Some(false) {
             let refused = match step {
                 Step::Close => None,
                 Step::Rate => Some("the adapter refuses the bit rate (BEL): choose one that it has"),
-                Step::Open => Some("the adapter refuses to open its channel (BEL): is another program using it?"),
+                Step::Open => {
+                    Some("the adapter refuses to open its channel (BEL): is another program using it?")
+                }
                 Step::DataRate => {
-                    heard(Heard::Note("the adapter refuses the data bit rate (BEL): it has no CAN FD, set fd = false".into()));
+                    heard(Heard::Note(
+                        "the adapter refuses the data bit rate (BEL): it has no CAN FD, set fd = false"
+                            .into(),
+                    ));
                     None
                 }
                 Step::Timestamps => {
-                    heard(Heard::Note("the adapter refuses timestamps (BEL): frames are stamped when they arrive".into()));
+                    heard(Heard::Note(
+                        "the adapter refuses timestamps (BEL): frames are stamped when they arrive".into(),
+                    ));
                     None
                 }
             };
@@ -307,7 +321,9 @@ impl Client {
         if !self.answered_setup && self.acknowledges.is_none() {
             self.acknowledges = Some(false);
             self.polls = false;
-            heard(Heard::Note("the adapter acknowledges nothing: frames count as sent when they are written".into()));
+            heard(Heard::Note(
+                "the adapter acknowledges nothing: frames count as sent when they are written".into(),
+            ));
         }
         self.state = State::Open;
         self.refusals = 0;
@@ -362,13 +378,18 @@ impl Client {
         out.extend(b"C\r");
         heard(Heard::State(
             ControllerState::BusOff,
-            format!("the adapter refused {REFUSALS} frames in a row: bus-off, or nobody acknowledges (termination, bit rate, partner?)"),
+            format!(
+                "the adapter refused {REFUSALS} frames in a row: bus-off, or nobody acknowledges (termination, bit rate, partner?)"
+            ),
         ));
         if self.channel.restart_ns == 0 {
             self.state = State::Dead;
-            return heard(Heard::Restarting("closed, and stays so because restart = \"0ms\"; restart the service".into()));
+            return heard(Heard::Restarting(
+                "closed, and stays so because bus_off_restart = \"0ms\"; restart the service".into(),
+            ));
         }
-        let pause_ns = (self.channel.restart_ns << self.restarts.min(16)).min(MAX_RESTART_NS.max(self.channel.restart_ns));
+        let pause_ns = (self.channel.restart_ns << self.restarts.min(16))
+            .min(MAX_RESTART_NS.max(self.channel.restart_ns));
         self.restarts += 1;
         self.state = State::Restart(now_ns + pause_ns);
         heard(Heard::Restarting(format!("closed, to be opened again in {} ms", pause_ns / 1_000_000)));
@@ -440,7 +461,9 @@ impl Peer for Client {
 
     fn tick(&mut self, now_ns: u64, out: &mut Vec<u8>, heard: &mut dyn FnMut(Heard)) {
         match self.state {
-            State::Setup(step, until_ns) if until_ns <= now_ns => self.advance(step, None, now_ns, out, heard),
+            State::Setup(step, until_ns) if until_ns <= now_ns => {
+                self.advance(step, None, now_ns, out, heard)
+            }
             State::Restart(until_ns) if until_ns <= now_ns => self.step(Step::Close, now_ns, out),
             State::Open => {
                 if let Some(&(what, since_ns)) = self.pending.front()

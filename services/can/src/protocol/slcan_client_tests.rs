@@ -178,7 +178,10 @@ fn who_is_no_adapter_is_told() {
         format!("{:?}", talk.told())
     };
     let all = [
-        fault(b"$GPGGA,1,2,3\r\n$GPGSA,A\r\n$GPGSV\r\n$GPRMC\r\n$GPVTG\r\n$GPGGA\r\n$GPGSA\r\n$GPGSV\r\n", true),
+        fault(
+            b"$GPGGA,1,2,3\r\n$GPGSA,A\r\n$GPGSV\r\n$GPRMC\r\n$GPVTG\r\n$GPGGA\r\n$GPGSA\r\n$GPGSV\r\n",
+            true,
+        ),
         refused_rate,
         refused_open,
     ];
@@ -193,10 +196,14 @@ fn who_is_no_adapter_is_told() {
 
 #[test]
 fn bit_rates() {
-    assert_eq!([10_000, 125_000, 500_000, 750_000, 800_000, 1_000_000, 5_000].map(rate_code), [
-        Some(0), Some(4), Some(6), Some(7), Some(7), Some(8), None
-    ]);
-    assert_eq!([2_000_000, 5_000_000, 2_500_000, 500_000].map(data_rate_code), [Some(2), Some(5), None, None]);
+    assert_eq!(
+        [10_000, 125_000, 500_000, 750_000, 800_000, 1_000_000, 5_000].map(rate_code),
+        [Some(0), Some(4), Some(6), Some(7), Some(7), Some(8), None]
+    );
+    assert_eq!(
+        [2_000_000, 5_000_000, 2_500_000, 500_000].map(data_rate_code),
+        [Some(2), Some(5), None, None]
+    );
 }
 
 #[test]

@@ -71,7 +71,8 @@ impl Decoder {
                 (false, _) => {
                     // Said once a piece, not once a byte.
                     let end = input.iter().position(|&c| c == b'<').unwrap_or(input.len());
-                    let blank = byte.is_ascii_whitespace() && input[..end].iter().all(u8::is_ascii_whitespace);
+                    let blank =
+                        byte.is_ascii_whitespace() && input[..end].iter().all(u8::is_ascii_whitespace);
                     *input = &input[end..];
                     if !blank {
                         return Some(Answer::Garbage);
@@ -208,13 +209,20 @@ impl Peer for Client {
                 }
                 (State::Open, Answer::Error) => {
                     return self.fault(
-                        format!("the server does not open bus '{}': it says '{}'", self.bus, self.decoder.text()),
+                        format!(
+                            "the server does not open bus '{}': it says '{}'",
+                            self.bus,
+                            self.decoder.text()
+                        ),
                         heard,
                     );
                 }
-                (_, Answer::Error) => heard(Heard::Note(format!("the server says '{}'", self.decoder.text()))),
+                (_, Answer::Error) => {
+                    heard(Heard::Note(format!("the server says '{}'", self.decoder.text())))
+                }
                 (State::Hi, _) => {
-                    return self.fault("what answers is no socketcand: it does not greet with < hi >".into(), heard);
+                    return self
+                        .fault("what answers is no socketcand: it does not greet with < hi >".into(), heard);
                 }
                 _ => {}
             }

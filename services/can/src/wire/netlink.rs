@@ -11,7 +11,9 @@ use crate::protocol::error_frame::ControllerState;
 #[derive(Debug, Error)]
 pub enum LinkError {
     /// Not there.
-    #[error("there is no interface '{name}' ({known}): plug the adapter in or load its driver; `ip -brief link` lists what there is")]
+    #[error(
+        "there is no interface '{name}' ({known}): plug the adapter in or load its driver; `ip -brief link` lists what there is"
+    )]
     Absent {
         /// Its name.
         name: String,
@@ -19,7 +21,9 @@ pub enum LinkError {
         known: String,
     },
     /// The kernel has no CAN.
-    #[error("this kernel has no SocketCAN: load it with `modprobe can_raw`, or use backend = \"slcan\" for a serial adapter")]
+    #[error(
+        "this kernel has no SocketCAN: load it with `modprobe can_raw`, or use backend = \"slcan\" for a serial adapter"
+    )]
     NoCan,
     /// Another kind of interface.
     #[error("interface '{0}' is no CAN interface")]
@@ -94,7 +98,9 @@ fn system(name: &str, what: &'static str) -> impl FnOnce(socketcan::Error) -> Li
 fn to_io(e: socketcan::Error) -> io::Error {
     match e {
         socketcan::Error::Io(e) => e,
-        socketcan::Error::Nl(e) => e.errno().map_or_else(|| io::Error::other(e.to_string()), io::Error::from_raw_os_error),
+        socketcan::Error::Nl(e) => {
+            e.errno().map_or_else(|| io::Error::other(e.to_string()), io::Error::from_raw_os_error)
+        }
         e => io::Error::other(e.to_string()),
     }
 }
@@ -225,7 +231,8 @@ fn set(wanted: &Wanted, is: &Interface, timing: bool) -> Result<String, LinkErro
         }
         link.set_bitrate(wanted.bitrate, None).map_err(system(name, "setting its bit rate"))?;
         if wanted.fd == Some(true) {
-            link.set_data_bitrate(wanted.data_bitrate, None).map_err(system(name, "setting its data bit rate"))?;
+            link.set_data_bitrate(wanted.data_bitrate, None)
+                .map_err(system(name, "setting its data bit rate"))?;
             link.set_ctrlmode(CanCtrlMode::Fd, true).map_err(system(name, "switching CAN FD on"))?;
         }
     }
@@ -264,11 +271,17 @@ mod tests {
         assert_eq!(differences(&wanted(), &Interface { bitrate: None, ..is }), Vec::<String>::new());
         let fd = Wanted { fd: Some(true), ..wanted() };
         let is = Interface { bitrate: Some(500_000), data_bitrate: Some(5_000_000), ..is };
-        assert_eq!(differences(&fd, &is), [
-            "it does not carry CAN FD, the stack file says fd = true",
-            "its data bit rate is 5000000, the stack file says 2000000"
-        ]);
-        assert_eq!(command(&fd, true), "ip link set can0 up type can bitrate 500000 dbitrate 2000000 fd on restart-ms 100");
+        assert_eq!(
+            differences(&fd, &is),
+            [
+                "it does not carry CAN FD, the stack file says fd = true",
+                "its data bit rate is 5000000, the stack file says 2000000"
+            ]
+        );
+        assert_eq!(
+            command(&fd, true),
+            "ip link set can0 up type can bitrate 500000 dbitrate 2000000 fd on restart-ms 100"
+        );
         assert_eq!(command(&wanted(), false), "ip link set can0 up");
     }
 
@@ -278,10 +291,24 @@ mod tests {
             LinkError::Absent { name: "can7".into(), known: "CAN interfaces here: can0, vcan0".into() },
             LinkError::NoCan,
             LinkError::NotCan("eth0".into()),
-            LinkError::Down { name: "can0".into(), command: command(&wanted(), true), why: " as root, or give this process CAP_NET_ADMIN" },
-            LinkError::System { name: "can0".into(), what: "setting its bit rate", source: io::ErrorKind::InvalidInput.into() },
+            LinkError::Down {
+                name: "can0".into(),
+                command: command(&wanted(), true),
+                why: " as root, or give this process CAP_NET_ADMIN",
+            },
+            LinkError::System {
+                name: "can0".into(),
+                what: "setting its bit rate",
+                source: io::ErrorKind::InvalidInput.into(),
+            },
         ];
-        insta::assert_snapshot!(all.map(|e| e.to_string()).join("\n"), @"");
+        insta::assert_snapshot!(all.map(|e| e.to_string()).join("\n"), @r#"
+        there is no interface 'can7' (CAN interfaces here: can0, vcan0): plug the adapter in or load its driver; `ip -brief link` lists what there is
+        this kernel has no SocketCAN: load it with `modprobe can_raw`, or use backend = "slcan" for a serial adapter
+        interface 'eth0' is no CAN interface
+        interface can0 is down: run `ip link set can0 up type can bitrate 500000 restart-ms 100` as root, or give this process CAP_NET_ADMIN
+        interface can0: setting its bit rate: invalid input parameter
+        "#);
     }
 
     #[test]

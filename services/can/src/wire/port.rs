@@ -73,7 +73,9 @@ pub enum Target {
 #[derive(Debug, Error)]
 pub enum PortError {
     /// No such device.
-    #[error("there is no device {0}: plug the adapter in; `ls /dev/serial/by-id` lists serial adapters by a name that stays")]
+    #[error(
+        "there is no device {0}: plug the adapter in; `ls /dev/serial/by-id` lists serial adapters by a name that stays"
+    )]
     Absent(String),
     /// Not permitted.
     #[error("no permission for {path}: {remedy}")]
@@ -90,7 +92,9 @@ pub enum PortError {
     #[error("{0} is no serial device")]
     NotSerial(String),
     /// Nobody there.
-    #[error("cannot connect to {address}: {source}; is the server running, and does the address say host and port?")]
+    #[error(
+        "cannot connect to {address}: {source}; is the server running, and does the address say host and port?"
+    )]
     Connect {
         /// Where.
         address: String,
@@ -196,11 +200,21 @@ mod tests {
             PortError::Busy("/dev/ttyACM0".into()).to_string(),
             PortError::Permission {
                 path: "/dev/ttyACM0".into(),
-                remedy: "it belongs to group 'dialout'; run `sudo usermod -aG dialout $USER`, then log in again".into(),
+                remedy:
+                    "it belongs to group 'dialout'; run `sudo usermod -aG dialout $USER`, then log in again"
+                        .into(),
             }
             .to_string(),
         ];
-        insta::assert_snapshot!(all.join("\n"), @"");
+        insta::assert_snapshot!(all.join("\n"), @r"
+        there is no device /dev/ttyNOTHERE: plug the adapter in; `ls /dev/serial/by-id` lists serial adapters by a name that stays
+        /dev is no serial device
+        /dev/null is no serial device
+        /etc/hostname is no serial device
+        cannot connect to 127.0.0.1:PORT: Connection refused (os error 111); is the server running, and does the address say host and port?
+        /dev/ttyACM0 is in use by another program: end it first (`fuser /dev/ttyACM0` names it)
+        no permission for /dev/ttyACM0: it belongs to group 'dialout'; run `sudo usermod -aG dialout $USER`, then log in again
+        ");
         assert_eq!(group_name(0).as_deref(), Some("root"));
         assert_eq!(group_name(u32::MAX - 7), None);
     }

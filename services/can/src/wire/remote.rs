@@ -14,6 +14,7 @@ use crate::server::{Host, sleep_until};
 
 /// Bytes read at once.
 const READ_BYTES: usize = 16 * 1024;
+const PULLED: &str = "the adapter was pulled; it is tried again";
 /// Bytes that may wait to be written before no more frames are taken.
 const WRITE_BYTES: usize = 16 * 1024;
 
@@ -76,7 +77,12 @@ impl<H: Host + 'static> Talk<'_, H> {
                 ready = self.port.ready(interest) => match ready {
                     Ok(false) => {}
                     Ok(true) => match self.port.try_read(&mut buffer) {
-                        Ok(0) => return "the other side ended the connection".to_owned(),
+                        Ok(0) => {
+                            return match self.port {
+                                Port::Tcp(_) => "the other side ended the connection; it is tried again".to_owned(),
+                                Port::Tty(_) => PULLED.to_owned(),
+                            };
+                        }
                         Ok(n) => {
                             let heard = &mut self.heard;
                             self.peer.receive(&buffer[..n], clock::mono_ns(), &mut self.out, &mut |h| heard.push(h));
@@ -191,7 +197,7 @@ impl<H: Host + 'static> Talk<'_, H> {
 
 fn gone(e: &io::Error) -> String {
     match e.raw_os_error() {
-        Some(libc::EIO | libc::ENXIO | libc::ENODEV) => "the adapter was pulled; it is tried again".to_owned(),
+        Some(libc::EIO | libc::ENXIO | libc::ENODEV) => PULLED.to_owned(),
         _ => format!("{e}; it is tried again"),
     }
 }

@@ -140,7 +140,12 @@ struct Wire<'a, H: Host> {
 }
 
 impl<'a, H: Host + 'static> Wire<'a, H> {
-    fn new(line: &'a Line<H>, settings: &'a Settings, socket: AsyncFd<OwnedFd>, interface: Interface) -> Self {
+    fn new(
+        line: &'a Line<H>,
+        settings: &'a Settings,
+        socket: AsyncFd<OwnedFd>,
+        interface: Interface,
+    ) -> Self {
         Self {
             line,
             settings,
@@ -189,7 +194,8 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
     fn raised(&mut self) {
         let name = &self.settings.wanted.name;
         let rate = self.interface.bitrate.map(|rate| format!(" at {rate} bit/s")).unwrap_or_default();
-        self.line.up(format!("interface {name} is up{rate}{}", if self.interface.fd { ", CAN FD" } else { "" }));
+        self.line
+            .up(format!("interface {name} is up{rate}{}", if self.interface.fd { ", CAN FD" } else { "" }));
         self.note();
     }
 
@@ -283,7 +289,9 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
         let fd_capable = self.interface.fd;
         let failed = hub.turn(|bus, _, now_ns| {
             loop {
-                let Some(frame) = self.held.take().or_else(|| bus.wire_next(now_ns, |f| fd_capable || !f.is_fd())) else {
+                let Some(frame) =
+                    self.held.take().or_else(|| bus.wire_next(now_ns, |f| fd_capable || !f.is_fd()))
+                else {
                     return None;
                 };
                 let (bytes, n) = sys::to_kernel(&frame);
@@ -314,7 +322,10 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
                 // The kernel does not want this frame: the next one may be better.
                 self.held = None;
                 hub.look(|bus, _| bus.wire_refused());
-                self.line.say(Level::Warning, format!("interface {} refuses a frame: {e}", self.settings.wanted.name));
+                self.line.say(
+                    Level::Warning,
+                    format!("interface {} refuses a frame: {e}", self.settings.wanted.name),
+                );
                 End::No
             }
         }
@@ -325,7 +336,10 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
         self.restart_at_ns = None;
         let wanted = &self.settings.wanted;
         let command = netlink::command(wanted, self.interface.settable);
-        self.line.down(format!("interface {} is down: frames wait until it is up again (`{command}`)", wanted.name));
+        self.line.down(format!(
+            "interface {} is down: frames wait until it is up again (`{command}`)",
+            wanted.name
+        ));
     }
 
     /// Once a second, or more often while down.
@@ -417,7 +431,7 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
         } else if pause_ms == 0 {
             self.line.say(
                 Level::Warning,
-                format!("interface {0} stays in bus-off, because restart = \"0ms\": `ip link set {0} type can restart`", self.settings.wanted.name),
+                format!("interface {0} stays in bus-off, because bus_off_restart = \"0ms\": `ip link set {0} type can restart`", self.settings.wanted.name),
             );
             self.restart_at_ns = Some(u64::MAX);
         }

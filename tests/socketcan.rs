@@ -1,0 +1,224 @@
+//! Real SocketCAN: a Linux that runs as an ordinary program (user-mode Linux) with the kernel's own CAN, and in it a stack
+//! on vcan0 beside unmodified can-utils.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+mod support;
+
+use serde_json::Value;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::Duration;
+use support::{peers, skip, wait_for};
+
+/// The guest has one slow processor.
+const LIMIT: Duration = Duration::from_mins(10);
+const COUNT: usize = 10_000;
+
+struct Work(PathBuf);
+
+impl Work {
+    /// The guest hides the host's /tmp, so results go beside the executable.
+    fn new() -> Self {
+        let target = Path::new(env!("CARGO_BIN_EXE_dinrail")).parent().unwrap();
+        let dir = target.join(format!("uml-{}", std::process::id()));
+        let _ = fs::remove_dir_all(&dir);
+        fs::create_dir_all(&dir).unwrap();
+        Self(dir)
+    }
+    fn text(&self, name: &str) -> String {
+        fs::read_to_string(self.0.join(name)).unwrap_or_default()
+    }
+    /// `ID#DATA` of every line of a candump log.
+    fn frames(&self, name: &str) -> Vec<String> {
+        self.text(name).lines().filter_map(|line| line.split_whitespace().nth(2)).map(str::to_owned).collect()
+    }
+    /// What a driver counted, as it says at its end.
+    fn sum(&self, interface: &str) -> String {
+        let log = self.text("up.log");
+        let line = log.lines().find(|line| line.contains(&format!(" {interface} in all: ")));
+        line.unwrap_or_else(|| panic!("no sum of {interface} in\n{log}")).to_owned()
+    }
+}
+
+impl Drop for Work {
+    fn drop(&mut self) {
+        if std::env::var_os("DINRAIL_KEEP").is_none() && !std::thread::panicking() {
+            let _ = fs::remove_dir_all(&self.0);
+        }
+    }
+}
+
+/// Boots the guest with a script; the script's results.
+fn boot(script: &str) -> Option<Work> {
+    peers::program("linux.uml", "user-mode-linux")?;
+    for (name, package) in [("candump", "can-utils"), ("ip", "iproute2"), ("insmod", "kmod")] {
+        peers::program(name, package)?;
+    }
+    let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/uml").canonicalize().unwrap();
+    let work = Work::new();
+    let log = fs::File::create(work.0.join("kernel.log")).unwrap();
+    // The kernel's memory is a file that is mapped executable.
+    let memory = ["/dev/shm", "/tmp", "/var/tmp"].into_iter().find(|dir| executable(Path::new(dir)));
+    let Some(memory) = memory else {
+        skip("no folder for temporary files allows to execute: user-mode Linux cannot boot");
+        return None;
+    };
+    let preload = work.0.join("xstate.so");
+    let built = Command::new("cc")
+        .args(["-O2", "-shared", "-fPIC", "-ldl", "-o"])
+        .args([&preload, &scripts.join("xstate.c")])
+        .status();
+    let preload = if built.is_ok_and(|status| status.success()) { preload } else { PathBuf::new() };
+    let mut guest = Command::new("linux.uml")
+        .args(["rootfstype=hostfs", "rootflags=/", "rw", "mem=1G", "con=null", "con0=fd:0,fd:1", "quiet"])
+        .arg(format!("init={}", scripts.join("init.sh").display()))
+        .arg(format!("WORK={}", work.0.display()))
+        .arg(format!("DINRAIL={}", env!("CARGO_BIN_EXE_dinrail")))
+        .arg(format!("SCRIPT={}", scripts.join(script).display()))
+        .env("TMPDIR", memory)
+        .env("LD_PRELOAD", preload)
+        .stdin(Stdio::null())
+        .stdout(log.try_clone().unwrap())
+        .stderr(log)
+        .spawn()
+        .unwrap();
+    let mut ended = false;
+    wait_for("the guest to end", LIMIT, || {
+        ended = guest.try_wait().unwrap().is_some();
+        (ended || work.0.join("done").exists()).then_some(())
+    });
+    // It halts by itself; what is left of it after the script's end is nothing anybody waits for.
+    if !ended {
+        std::thread::sleep(Duration::from_secs(1));
+        let _ = guest.kill();
+    }
+    let _ = guest.wait();
+    assert!(
+        work.0.join("booted").exists(),
+        "the guest did not boot:\n{}\n{}",
+        work.text("kernel.log"),
+        work.text("insmod.log")
+    );
+    assert!(
+        work.0.join("done").exists(),
+        "the guest ended early:\n{}\n{}",
+        work.text("kernel.log"),
+        work.text("script.log")
+    );
+    Some(work)
+}
+
+/// Whether a program there could be run: user-mode Linux maps its memory executable.
+fn executable(dir: &Path) -> bool {
+    let script = dir.join(format!("dinrail-exec-{}", std::process::id()));
+    let written = fs::copy("/bin/true", &script).is_ok();
+    let runs = written && Command::new(&script).status().is_ok_and(|status| status.success());
+    let _ = fs::remove_file(&script);
+    runs
+}
+
+#[test]
+fn a_stack_on_a_kernel_interface() {
+    let Some(work) = boot("socketcan.sh") else { return };
+    let told = || format!("{}\n--- up.log\n{}", work.text("script.log"), work.text("up.log"));
+    assert_eq!(work.text("in_vain"), "", "{}", told());
+    own_transmissions(&work, &told());
+    frames_of_others(&work);
+    ten_thousand_each_way(&work);
+    down_and_up(&work, &told());
+    slcan(&work);
+}
+
+/// Sent by the stack: on the wire once and in order; on `rx` once, in the same order, marked as ours.
+fn own_transmissions(work: &Work, told: &str) {
+    let sent: Vec<String> = work.text("own.sent").lines().map(str::to_owned).collect();
+    assert_eq!(sent.len(), 205);
+    let wire = work.frames("own.candump");
+    // candump writes the others' frames behind them.
+    assert_eq!(wire[..sent.len().min(wire.len())], sent, "{told}");
+    let rx: Vec<Value> =
+        work.text("own.dump").lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let echoes: Vec<&str> =
+        rx.iter().filter(|f| f["echo"] == true).map(|f| f["frame"].as_str().unwrap()).collect();
+    assert_eq!(echoes, sent);
+    let stamps: Vec<i64> = rx.iter().map(|f| f["utc_ns"].as_i64().unwrap()).collect();
+    assert!(stamps.is_sorted(), "stamps go backwards");
+}
+
+fn frames_of_others(work: &Work) {
+    let rx = work.text("own.dump");
+    let others: Vec<String> = rx
+        .lines()
+        .map(|line| serde_json::from_str::<Value>(line).unwrap())
+        .filter(|f| f["echo"] == false)
+        .map(|f| f["frame"].as_str().unwrap().to_owned())
+        .collect();
+    let expected = [
+        "123##3AABBCC",
+        "456#R2",
+        "20000204#0020000000008000",
+        "20000040#0000000000000000",
+        "20000100#0000000000000000",
+        "00000777#01",
+    ];
+    assert_eq!(others, expected);
+    let log = work.text("up.log");
+    assert!(
+        log.contains("vcan0 is error passive: error passive by transmit errors; TEC 128, REC 0"),
+        "{log}"
+    );
+    assert!(log.contains("vcan0 is bus-off"), "{log}");
+    assert!(log.contains("there is no interface 'nocan7' (CAN interfaces here: vcan0)"), "{log}");
+}
+
+/// 10,000 frames in and 10,000 out at the same time: none lost, none twice, order kept, nothing dropped by the kernel.
+fn ten_thousand_each_way(work: &Work) {
+    let inward: Vec<String> = (0..COUNT).map(|i| format!("{:03X}#{i:08X}", i % 2048)).collect();
+    let outward: Vec<String> = (0..COUNT).map(|i| format!("{:08X}#{i:08X}", 0x10000 + i % 2048)).collect();
+    for file in ["out.candump", "in.dump"] {
+        let (long, short): (Vec<String>, Vec<String>) =
+            work.frames(file).into_iter().partition(|frame| frame.find('#') == Some(8));
+        assert!(short == inward, "{file}: {} frames inward", short.len());
+        assert!(long == outward, "{file}: {} frames outward", long.len());
+    }
+    let sum = work.sum("vcan0");
+    for expected in [
+        " 10006 received, ",
+        " 3 error frames, ",
+        " 0 dropped by the kernel, ",
+        "; 1 times bus-off, 1 restarts, 4 times down",
+    ] {
+        assert!(sum.contains(expected), "no '{expected}' in {sum}");
+    }
+}
+
+fn down_and_up(work: &Work, told: &str) {
+    assert_eq!(work.frames("up.send"), ["00B#01", "00B#02", "00B#03", "00C#01"], "{told}");
+    // What waited while it was down was sent when it came back, or was too old: never twice.
+    for round in 1..=3 {
+        let count = work.frames("updown.dump").iter().filter(|f| **f == format!("00A#0{round}")).count();
+        assert!(count <= 1, "{count} times {round}");
+    }
+    let log = work.text("up.log");
+    assert!(
+        log.contains("interface vcan0 is down: frames wait until it is up again (`ip link set vcan0 up`)"),
+        "{log}"
+    );
+}
+
+fn slcan(work: &Work) {
+    let virt = work.frames("virt.dump");
+    for frame in ["321#1122", "1ABCDEF0#0102030405060708", "123#R3"] {
+        assert!(virt.iter().any(|f| f == frame), "{frame} is not in {virt:?}");
+    }
+    assert_eq!(
+        work.frames("slcan0.candump")
+            .split_off(0)
+            .into_iter()
+            .filter(|f| !f.starts_with("321#"))
+            .collect::<Vec<_>>(),
+        ["1ABCDEF0#0102030405060708", "123#R3", "7AB#01", "1BCDEF01#", "055#R2"]
+    );
+    assert_eq!(work.frames("far.dump"), ["123#01", "1ABCDEF0#02"]);
+}

@@ -1,0 +1,176 @@
+# Runs inside the guest: a stack on vcan0 beside can-utils. Writes what happened to $WORK; the test judges it.
+set -u
+cd /tmp
+COUNT=10000
+
+cat >stack.toml <<'STACK'
+[stack]
+name = "uml"
+
+[[service]]
+name = "can0"
+kind = "can"
+backend = "socketcan"
+interface = "vcan0"
+serve = { socketcand = "127.0.0.1:29536" }
+
+[[service]]
+name = "gone"
+kind = "can"
+backend = "socketcan"
+interface = "nocan7"
+
+[[service]]
+name = "virt"
+kind = "can"
+backend = "virtual"
+serve = { slcan_pty = "slcan" }
+
+[[service]]
+name = "adapter"
+kind = "can"
+backend = "slcan"
+interface = "/tmp/slcan2"
+
+[[service]]
+name = "far"
+kind = "can"
+backend = "virtual"
+serve = { slcan_pty = "slcan2" }
+STACK
+
+say() { echo "--- $(date +%s.%N) $*"; }
+# Waits until a command succeeds; 60 s.
+until_ok() {
+    local what=$1 i
+    shift
+    for i in $(seq 600); do
+        if "$@" >/dev/null 2>&1; then say "ok: $what"; return 0; fi
+        sleep 0.1
+    done
+    say "IN VAIN: $what"
+    echo "$what" >>"$WORK/in_vain"
+    return 1
+}
+health() { "$DINRAIL" ps --json | python3 -c 'import json,sys; print(next(r["health"] for r in json.load(sys.stdin) if r["service"] == sys.argv[1]))' "$1"; }
+is() { [ "$(health "$1")" = "$2" ]; }
+lines() { [ "$(wc -l <"$1")" -ge "$2" ]; }
+
+"$DINRAIL" up stack.toml >"$WORK/up.log" 2>&1 &
+until_ok "the driver works" is can0 ready
+until_ok "a missing interface does not stop the stack" is gone degraded
+until_ok "the serial adapter works" is adapter ready
+
+say "own transmissions"
+candump -L vcan0 >"$WORK/own.candump" &
+own=$!
+"$DINRAIL" can dump can0 --json >"$WORK/own.dump" 2>&1 &
+dump=$!
+sleep 1
+frames=()
+for i in $(seq 0 199); do frames+=("$(printf '%03X#%08X' $((i * 7 % 2048)) "$i")"); done
+frames+=(1ABCDEF0#0102030405060708 123#R4 7FF# "321##1$(printf 'A5%.0s' $(seq 64))" '1ABCDEF0##0')
+printf '%s\n' "${frames[@]}" >"$WORK/own.sent"
+"$DINRAIL" can send can0 "${frames[@]}" >"$WORK/own.send" 2>&1
+until_ok "candump saw them" lines "$WORK/own.candump" "${#frames[@]}"
+
+say "frames of others: FD, remote, error"
+cansend vcan0 123##3AABBCC
+cansend vcan0 456#R2
+cansend vcan0 20000204#0020000000008000
+cansend vcan0 20000040#0000000000000000
+cansend vcan0 20000100#0000000000000000
+cansend vcan0 00000777#01
+until_ok "the stack saw them" grep -q '00000777#01' "$WORK/own.dump"
+sleep 0.5
+kill $own $dump
+
+say "$COUNT frames each way at 2000/s"
+python3 - "$COUNT" >in.log <<'PY'
+import sys
+for i in range(int(sys.argv[1])):
+    print(f"({1700000000 + i / 2000:.6f}) c {i % 2048:03X}#{i:08X}")
+PY
+# A receive buffer that lets it sleep for seconds on this one processor.
+candump -r 33554432 -L vcan0 >out.candump 2>"$WORK/out.candump.err" &
+out=$!
+"$DINRAIL" can dump can0 >in.dump 2>"$WORK/in.dump.err" &
+dump=$!
+sleep 1
+canplayer -I in.log vcan0=c &
+player=$!
+python3 - "$COUNT" <<'PY'
+import socket, sys, time
+s = socket.create_connection(("127.0.0.1", 29536))
+def answer():
+    text = b""
+    while not text.endswith(b">"):
+        text += s.recv(64)
+    return text
+assert answer() == b"< hi >"
+for command in (b"< open can0 >", b"< rawmode >"):
+    s.sendall(command)
+    assert answer() == b"< ok >"
+s.sendall(b"< bcmmode >")
+start = time.monotonic()
+for i in range(int(sys.argv[1])):
+    s.sendall(b"< send %08X 4 %x %x %x %x >" % (0x10000 + i % 2048, *i.to_bytes(4, "big")))
+    if i % 20 == 19:
+        time.sleep(max(0, start + (i + 1) / 2000 - time.monotonic()))
+time.sleep(1)
+PY
+wait $player
+until_ok "candump saw both directions" lines out.candump $((2 * COUNT))
+until_ok "the stack saw both directions" lines in.dump $((2 * COUNT))
+kill $out $dump
+cp out.candump in.dump "$WORK"
+
+say "down and up again"
+"$DINRAIL" can dump can0 >"$WORK/updown.dump" 2>&1 &
+dump=$!
+for round in 1 2 3; do
+    ip link set vcan0 down
+    until_ok "down $round seen" is can0 degraded
+    "$DINRAIL" can send can0 "00A#0$round" >>"$WORK/down.send" 2>&1
+    ip link set vcan0 up
+    until_ok "up $round seen" is can0 ready
+    cansend vcan0 "70$round#"
+    until_ok "frame $round after it" grep -q "70$round#" "$WORK/updown.dump"
+    "$DINRAIL" can send can0 "00B#0$round" >>"$WORK/up.send" 2>&1
+done
+say "deleted and made again"
+ip link del vcan0
+until_ok "gone seen" is can0 degraded
+ip link add dev vcan0 type vcan mtu 72
+# Raised by the driver, which may.
+until_ok "back" is can0 ready
+"$DINRAIL" can send can0 "00C#01" >>"$WORK/up.send" 2>&1
+kill $dump
+
+say "slcand on our terminal"
+"$DINRAIL" can dump virt >"$WORK/virt.dump" 2>&1 &
+dump=$!
+slcand -o -s6 "$(readlink /tmp/slcan)" slcan0
+until_ok "slcan0 is there" ip link set slcan0 up
+candump -L slcan0 >"$WORK/slcan0.candump" &
+candumped=$!
+sleep 1
+until_ok "a frame of slcand" sh -c "cansend slcan0 321#1122; sleep 0.2; grep -q '321#1122' $WORK/virt.dump"
+cansend slcan0 1ABCDEF0#0102030405060708
+cansend slcan0 123#R3
+until_ok "a remote frame of slcand" grep -q '123#R3' "$WORK/virt.dump"
+"$DINRAIL" can send virt 7AB#01 1BCDEF01# 055#R2 >"$WORK/virt.send" 2>&1
+until_ok "frames to slcand" grep -q '055#R2' "$WORK/slcan0.candump"
+kill $dump $candumped
+kill "$(pidof slcand)"
+
+say "our SLCAN client on our terminal"
+"$DINRAIL" can dump far >"$WORK/far.dump" 2>&1 &
+dump=$!
+sleep 0.5
+"$DINRAIL" can send adapter 123#01 1ABCDEF0#02 >"$WORK/adapter.send" 2>&1
+until_ok "frames by the adapter" grep -q '1ABCDEF0#02' "$WORK/far.dump"
+kill $dump
+"$DINRAIL" down
+wait
+say "end"
