@@ -30,6 +30,8 @@ seed("socketcand", "nonsense", "garbage< >< add 1 0 123 1 00 >< send >< open can
 seed("candump", "log", "(1436509052.249713) can0 123#DEADBEEF\n(1436509052.450000) can0 1ABCDEF0#R4 T\n"
      "# a comment\n\n(0.000000001) vcan7 7FF##5" + "00" * 64 + " R\n(1.5) can0 20000080#0000000000000000\n")
 seed("candump", "frames", "123#\n123#R\n123#11.22.33\n00000123##0AA\n80000123#00\n12#00\n800#\n123##\n")
+# Found by fuzzing: a stamp whose ninth decimal is half a character.
+seed("candump", "stamp", "(1.00000000é) can0 123#00\n")
 
 # --- Modbus ----------------------------------------------------------------------------------------------------
 
@@ -205,6 +207,8 @@ seed("mcap_reader", "zstd", FILE + chunk(CHANNELS + MESSAGES, "zstd") + END)
 seed("mcap_reader", "cut", (FILE + chunk(CHANNELS + MESSAGES, "zstd"))[:-40])
 seed("mcap_reader", "damaged", FILE + chunk(CHANNELS) + chunk(MESSAGES).replace(b"started", b"damaged") + chunk(MESSAGES) + END)
 seed("mcap_reader", "empty", MAGIC)
+# Found by fuzzing: lengths that overflow when they are added up.
+seed("mcap_reader", "chunk_of_2_64_bytes", MAGIC + record(6, pack("<QQQI", 0, 0, 0, 0) + text("") + pack("<Q", 2**64 - 1)) + END)
 
 # --- Programs --------------------------------------------------------------------------------------------------
 

@@ -171,7 +171,7 @@ fn works(stack: &Stack, port: u16) {
 
 /// The frames of `can dump` as `ID#DATA`, one a line.
 fn compact(dump: &str) -> String {
-    dump.lines().filter_map(|line| line.split_whitespace().nth(2)).map(|frame| format!("{frame}\n")).collect()
+    dump.lines().filter_map(|line| line.split_whitespace().nth(2)).collect::<Vec<_>>().join("\n")
 }
 
 fn generations(stack: &Stack) -> BTreeMap<String, u64> {
@@ -332,7 +332,7 @@ fn three_hundred_kills_at_random_moments_of_start_up_brick_nothing() {
     let mut kills = 0;
     let start = Instant::now();
     while kills < 300 {
-        assert!(start.elapsed() < Duration::from_secs(240), "{kills} kills only\n{}", stack.log());
+        assert!(start.elapsed() < Duration::from_mins(4), "{kills} kills only\n{}", stack.log());
         let victim = SERVICES[kills % SERVICES.len()];
         let Some(pid) = stack.service(victim).and_then(|row| row["pid"].as_i64()) else { continue };
         let Some(pid) = rustix::process::Pid::from_raw(pid as i32) else { continue };

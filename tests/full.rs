@@ -95,6 +95,12 @@ impl Boxed {
 
 impl Drop for Boxed {
     fn drop(&mut self) {
+        // Gently first: a launcher that is killed leaves its shared memory to the next `up`.
+        let pid = rustix::process::Pid::from_child(&self.child);
+        if matches!(self.child.try_wait(), Ok(None)) {
+            let _ = rustix::process::kill_process(pid, rustix::process::Signal::TERM);
+            sleep(Duration::from_secs(3));
+        }
         let _ = self.child.kill();
         let _ = self.child.wait();
     }

@@ -29,9 +29,17 @@ impl Work {
     fn text(&self, name: &str) -> String {
         fs::read_to_string(self.0.join(name)).unwrap_or_default()
     }
-    /// `ID#DATA` of every line of a candump log.
+    /// `ID#DATA` of every line of a candump log. Kernels mark CAN FD frames in the flags that candump shows; that mark
+    /// is taken off.
     fn frames(&self, name: &str) -> Vec<String> {
-        self.text(name).lines().filter_map(|line| line.split_whitespace().nth(2)).map(str::to_owned).collect()
+        let unmarked = |frame: &str| match frame.split_once("##") {
+            Some((id, rest)) => {
+                let flags = u32::from_str_radix(&rest[..1], 16).unwrap() & 3;
+                format!("{id}##{flags}{}", &rest[1..])
+            }
+            None => frame.to_owned(),
+        };
+        self.text(name).lines().filter_map(|line| line.split_whitespace().nth(2)).map(unmarked).collect()
     }
     /// What a driver counted, as it says at its end.
     fn sum(&self, interface: &str) -> String {

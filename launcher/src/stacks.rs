@@ -23,7 +23,7 @@ macro_rules! files {
 pub static STACKS: &[ReadyStack] = &[ReadyStack {
     name: "demo",
     about: "a conveyor's CAN bus, a program, Modbus TCP and a recorder",
-    files: files!("demo": "README.md", "TOUR.txt", "conveyor.log", "main.st", "stack.toml"),
+    files: files!("demo": "README.md", "conveyor.log", "main.st", "stack.toml"),
 }];
 
 /// The ready stack of this name.

@@ -32,9 +32,8 @@ impl Load {
                 let (start, first) = (Instant::now(), sent);
                 while !ended.load(Ordering::Relaxed) && stream.write_all(frames.as_bytes()).is_ok() {
                     sent += BATCH;
-                    if rate > 0 {
-                        let due = Duration::from_nanos((sent - first) * 1_000_000_000 / rate);
-                        sleep(due.saturating_sub(start.elapsed()));
+                    if let Some(due_ns) = ((sent - first) * 1_000_000_000).checked_div(rate) {
+                        sleep(Duration::from_nanos(due_ns).saturating_sub(start.elapsed()));
                     }
                 }
             }

@@ -13,12 +13,30 @@ pub fn run(from: &str, dir: Option<&Path>) -> anyhow::Result<()> {
     };
     let dir = dir.map_or_else(|| PathBuf::from(ready.name), Path::to_owned);
     ready.write_to(&dir)?;
+    name_it(ready.name, &dir)?;
     for (name, _) in ready.files {
         print(&format!("{}\n", dir.join(name).display()));
     }
     let shown = dir.display();
     eprintln!("next: dinrail check {shown} && dinrail up {shown}");
     Ok(())
+}
+
+/// The copy gets its folder's name, so that it runs beside the one it came from.
+fn name_it(from: &str, dir: &Path) -> anyhow::Result<()> {
+    let Some(name) = dir.file_name().and_then(|n| n.to_str()).filter(|n| is_stack_name(n)) else {
+        return Ok(());
+    };
+    let path = dir.join("stack.toml");
+    let text = std::fs::read_to_string(&path)?;
+    std::fs::write(&path, text.replacen(&format!("name = \"{from}\""), &format!("name = \"{name}\""), 1))?;
+    Ok(())
+}
+
+fn is_stack_name(name: &str) -> bool {
+    name.len() <= 32
+        && name.starts_with(|c: char| c.is_ascii_lowercase())
+        && name.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-' || c == '_')
 }
 
 /// The ready stacks as a table.

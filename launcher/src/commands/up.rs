@@ -11,8 +11,8 @@ use std::process::ExitCode;
 
 /// Name of the ready stack that `demo` runs.
 const DEMO: &str = "demo";
-/// Text of its tour, beside its stack.toml.
-const TOUR: &str = "TOUR.txt";
+/// Text of its tour, with places for the executable and the folder.
+const TOUR: &str = include_str!("demo_tour.txt");
 
 /// Starts the stack of a file and runs it until it ends.
 pub fn up(path: &Path, duration: Option<Span>, json: bool) -> anyhow::Result<ExitCode> {
@@ -32,8 +32,7 @@ pub fn demo(dir: &Path, duration: Option<Span>, json: bool) -> anyhow::Result<Ex
         ready.write_to(dir)?;
     }
     let loaded = load(dir)?;
-    let tour =
-        std::fs::read_to_string(dir.join(TOUR)).ok().filter(|_| !json).map(|text| paste_ready(&text, dir));
+    let tour = (!json).then(|| paste_ready(TOUR, dir));
     let options = Options { duration: duration.map(|d| d.duration()), progress: true, json, tour };
     run(loaded, &options)
 }

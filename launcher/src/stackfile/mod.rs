@@ -117,6 +117,9 @@ fn read_file(path: &Path) -> Result<String, (String, &'static str)> {
             "name a stack file or its folder; `dinrail new --from demo DIR` makes one",
         )
     })?;
+    if !metadata.is_file() {
+        return Err(("this is no regular file".to_owned(), "name a stack file or its folder"));
+    }
     if metadata.len() > FILE_MAX {
         return Err((
             format!("the file has {} bytes; a stack file has at most {FILE_MAX}", metadata.len()),

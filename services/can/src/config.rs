@@ -563,7 +563,7 @@ mod tests {
             ),
             said(json!({ "backend": "socketcan", "interface": "nocan42" })),
             said(
-                json!({ "backend": "slcan", "bitrate": "33k", "baud": 115201, "fd": true, "data_bitrate": "2500k" }),
+                json!({ "backend": "slcan", "bitrate": "33k", "baud": 115_201, "fd": true, "data_bitrate": "2500k" }),
             ),
             said(json!({ "backend": "slcan", "interface": "tcp://adapter" })),
             said(json!({ "backend": "socketcand" })),

@@ -5,7 +5,7 @@ use std::io;
 use std::os::fd::{AsRawFd, BorrowedFd};
 
 use crate::protocol::Frame;
-use crate::protocol::frame::FD_FDF;
+use crate::protocol::frame::{FD_BRS, FD_ESI, FD_FDF};
 
 /// Frames taken by one call.
 pub const BATCH: usize = 64;
@@ -58,7 +58,8 @@ pub fn to_kernel(frame: &Frame) -> ([u8; FD_BYTES], usize) {
     let mut bytes = [0; FD_BYTES];
     bytes[..4].copy_from_slice(&frame.can_id.to_ne_bytes());
     bytes[4] = frame.len;
-    bytes[5] = frame.fd;
+    // The kernel sets its own mark for CAN FD.
+    bytes[5] = frame.fd & (FD_BRS | FD_ESI);
     let payload = frame.payload();
     bytes[8..8 + payload.len()].copy_from_slice(payload);
     (bytes, if frame.is_fd() { FD_BYTES } else { CLASSIC_BYTES })

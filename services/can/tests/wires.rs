@@ -26,12 +26,14 @@ mod python;
 /// Longest wait for anything; never a measure of speed.
 const PATIENCE: Duration = Duration::from_mins(1);
 
+type Said = Rc<RefCell<Vec<String>>>;
+type Bus = Rc<Hub<Listener>>;
 type Seen = Rc<RefCell<Vec<(Frame, Origin)>>>;
 
 #[derive(Default)]
 struct Listener {
     seen: Seen,
-    said: Rc<RefCell<Vec<String>>>,
+    said: Said,
 }
 
 impl Tap for Listener {
@@ -64,7 +66,7 @@ fn settings() -> Settings {
 }
 
 /// A bus with its clock running and what was seen on it.
-fn bus() -> (Rc<Hub<Listener>>, Seen, Rc<RefCell<Vec<String>>>) {
+fn bus() -> (Bus, Seen, Said) {
     let host = Listener::default();
     let (seen, said) = (host.seen.clone(), host.said.clone());
     let hub = Hub::new(settings(), host, None).unwrap();
@@ -110,10 +112,7 @@ async fn push_all(hub: &Rc<Hub<Listener>>, frames: &[Frame]) {
     }
 }
 
-fn behind(
-    target: Target,
-    peer: Box<dyn Peer>,
-) -> (Rc<Hub<Listener>>, Seen, Rc<RefCell<Vec<String>>>, Rc<RefCell<LinkStatus>>) {
+fn behind(target: Target, peer: Box<dyn Peer>) -> (Bus, Seen, Said, Rc<RefCell<LinkStatus>>) {
     let (hub, seen, said) = bus();
     hub.look(|bus, _| bus.attach_wire(peer.flight()));
     let line = Line::new(hub.clone(), "wire0");

@@ -462,7 +462,7 @@ impl Peer for Client {
     fn tick(&mut self, now_ns: u64, out: &mut Vec<u8>, heard: &mut dyn FnMut(Heard)) {
         match self.state {
             State::Setup(step, until_ns) if until_ns <= now_ns => {
-                self.advance(step, None, now_ns, out, heard)
+                self.advance(step, None, now_ns, out, heard);
             }
             State::Restart(until_ns) if until_ns <= now_ns => self.step(Step::Close, now_ns, out),
             State::Open => {

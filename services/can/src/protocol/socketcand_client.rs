@@ -218,7 +218,7 @@ impl Peer for Client {
                     );
                 }
                 (_, Answer::Error) => {
-                    heard(Heard::Note(format!("the server says '{}'", self.decoder.text())))
+                    heard(Heard::Note(format!("the server says '{}'", self.decoder.text())));
                 }
                 (State::Hi, _) => {
                     return self

@@ -101,7 +101,7 @@ fn to_io(e: socketcan::Error) -> io::Error {
         socketcan::Error::Nl(e) => {
             e.errno().map_or_else(|| io::Error::other(e.to_string()), io::Error::from_raw_os_error)
         }
-        e => io::Error::other(e.to_string()),
+        e @ socketcan::Error::Can(_) => io::Error::other(e.to_string()),
     }
 }
 

@@ -170,7 +170,7 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
         let hub = self.line.hub.clone();
         loop {
             let up = self.line.status.borrow().up;
-            let look = if !up { DOWN_LOOK } else { self.restart_pause().unwrap_or(LOOK) };
+            let look = if up { self.restart_pause().unwrap_or(LOOK) } else { DOWN_LOOK };
             let end = tokio::select! {
                 ready = self.socket.readable() => match ready {
                     Ok(mut guard) => {
@@ -289,11 +289,8 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
         let fd_capable = self.interface.fd;
         let failed = hub.turn(|bus, _, now_ns| {
             loop {
-                let Some(frame) =
-                    self.held.take().or_else(|| bus.wire_next(now_ns, |f| fd_capable || !f.is_fd()))
-                else {
-                    return None;
-                };
+                let waiting = self.held.take();
+                let frame = waiting.or_else(|| bus.wire_next(now_ns, |f| fd_capable || !f.is_fd()))?;
                 let (bytes, n) = sys::to_kernel(&frame);
                 match rustix::io::write(self.socket.get_ref(), &bytes[..n]) {
                     Ok(_) => {}
