@@ -4,8 +4,8 @@
 //! a process and holds it, so that a service that dies while it starts can never leave a half-made one.
 
 use crate::payload::{
-    CanFrame, Encoding, Event, Health, Image, ImageWrite, Inputs, Job, JobResult, PART_BYTES, Payload,
-    ScanPart, Status,
+    CHUNK_BYTES, CanFrame, Encoding, Event, Health, Image, ImageWrite, Inputs, Job, JobResult, PART_BYTES,
+    Payload, ScanPart, SerialChunk, Status,
 };
 use serde::{Deserialize, Serialize};
 
@@ -26,6 +26,8 @@ pub enum WhenFull {
 pub enum TopicKind {
     CanRx,
     CanTx,
+    SerialRx,
+    SerialTx,
     Inputs,
     Image,
     Writes,
@@ -64,6 +66,10 @@ macro_rules! with_payload {
         match $kind {
             $crate::topic::TopicKind::CanRx | $crate::topic::TopicKind::CanTx => {
                 type $t = $crate::payload::CanFrame;
+                $body
+            }
+            $crate::topic::TopicKind::SerialRx | $crate::topic::TopicKind::SerialTx => {
+                type $t = $crate::payload::SerialChunk;
                 $body
             }
             $crate::topic::TopicKind::Inputs => {
@@ -108,9 +114,11 @@ macro_rules! with_payload {
 
 impl TopicKind {
     /// Every kind, for tables and tests.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 14] = [
         Self::CanRx,
         Self::CanTx,
+        Self::SerialRx,
+        Self::SerialTx,
         Self::Inputs,
         Self::Image,
         Self::Writes,
@@ -140,6 +148,9 @@ impl TopicKind {
         match self {
             Self::CanRx => row("rx", CanFrame::NAME, 4096, 0, Oldest, false, true),
             Self::CanTx => row("tx", CanFrame::NAME, 1024, 0, Refuse, false, false),
+            // 0.5 s of the shortest RTU frames at 115200 baud are some 200; short raw chunks come faster.
+            Self::SerialRx => row("rx", SerialChunk::NAME, 1024, CHUNK_BYTES as u32, Oldest, false, true),
+            Self::SerialTx => row("tx", SerialChunk::NAME, 64, CHUNK_BYTES as u32, Refuse, false, false),
             Self::Inputs => row("inputs", Inputs::NAME, 256, 4096, Oldest, true, true),
             Self::Image => row("image", Image::NAME, 2, 3 * 4096, Oldest, true, false),
             Self::Writes => row("writes", ImageWrite::NAME, 256, 512, Refuse, false, false),

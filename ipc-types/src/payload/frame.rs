@@ -103,3 +103,53 @@ impl CanFrame {
         None
     }
 }
+
+/// Flags in [`SerialChunk::flags`].
+pub mod serial_flag {
+    /// On `rx`: these bytes were sent by a process of the stack and have left the port.
+    pub const TX_ECHO: u32 = 1;
+    /// The chunk ends a frame: the line was silent behind it (framing `rtu`, `silence`), or its delimiter or
+    /// length was reached. Absent: the frame goes on in the next chunk.
+    pub const END: u32 = 2;
+    /// A silence of more than 1.5 characters lay inside the frame (serial line guide V1.02, 2.5.1.1).
+    pub const GAP: u32 = 4;
+    /// The UART saw a parity error in it.
+    pub const PARITY: u32 = 8;
+    /// The UART saw a framing error in it.
+    pub const FRAMING: u32 = 16;
+    /// Bytes were lost before or in it: overrun of the UART or of the driver's buffer.
+    pub const OVERRUN: u32 = 32;
+    /// The line was held low longer than a character.
+    pub const BREAK: u32 = 64;
+    /// On `rx` with [`TX_ECHO`]: the bytes could not be sent, because the port was gone or its deadline was over.
+    pub const NOT_SENT: u32 = 128;
+    /// On `tx`: start at once, without waiting until the line was silent for 3.5 characters.
+    pub const AT_ONCE: u32 = 256;
+    /// Every flag that tells of a damaged frame.
+    pub const DAMAGED: u32 = PARITY | FRAMING | OVERRUN | BREAK;
+}
+
+/// Most bytes of one [`SerialChunk`]; a longer frame travels in several.
+pub const CHUNK_BYTES: usize = 1024;
+
+payload! {
+    /// Bytes of a serial port on `<serial>/rx` or `<serial>/tx`: one frame, or a part of a long one. Tail: the bytes.
+    ///
+    /// On `rx`, `stamp.t_ns` is when the driver knew the end of the chunk and `stamp.seq` is the line's one true
+    /// order. An echo carries writer, generation and seq of the message on `tx` that it confirms.
+    pub struct SerialChunk: "dinrail.SerialChunk/1", tail, Ros1 {
+        /// CLOCK_MONOTONIC of the first byte in ns. On `tx`: the time after which it shall not be sent any more,
+        /// 0 for none.
+        pub first_t_ns: u64,
+        /// Of an echo: `stamp.seq` of the message on `tx`. Otherwise 0.
+        pub tx_seq: u64,
+        /// Of an echo: `stamp.writer` of the message on `tx`. Otherwise 0.
+        pub tx_writer: u32,
+        /// Of an echo: `stamp.generation` of the message on `tx`. Otherwise 0.
+        pub tx_generation: u32,
+        /// [`serial_flag`]s.
+        pub flags: u32,
+        /// Bytes of the tail.
+        pub n: u32,
+    }
+}

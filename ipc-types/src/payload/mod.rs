@@ -16,7 +16,7 @@ mod image;
 mod plumbing;
 mod service;
 
-pub use frame::{CanFrame, can_flag, fd_flag, id_flag};
+pub use frame::{CHUNK_BYTES, CanFrame, SerialChunk, can_flag, fd_flag, id_flag, serial_flag};
 pub use image::{
     AckEntry, Image, ImageWrite, Inputs, MAX_ACKS, PART_BYTES, PlcState, Quality, ScanPart, acks,
 };

@@ -1,0 +1,1 @@
+//! CANopen master and slave.

@@ -1,0 +1,1 @@
+//! The serial port driver: one process a port.
