@@ -33,6 +33,13 @@ seed("candump", "frames", "123#\n123#R\n123#11.22.33\n00000123##0AA\n80000123#00
 # Found by fuzzing: a stamp whose ninth decimal is half a character.
 seed("candump", "stamp", "(1.00000000é) can0 123#00\n")
 
+seed("asc", "measurement", "date Sat Sep 30 10:06:13.191 pm 2017\nbase hex  timestamps absolute\ninternal events logged\n"
+     "Begin Triggerblock Sam Okt 30 22:06:13.191 2017\n   0.000000 Start of measurement\n   0.1 1  123  Rx   d 2 AA BB\n"
+     "   0.2 2  1ABCDEF0x  Tx   r 8\n   0.3 1  ErrorFrame\n"
+     "   0.4 CANFD   1 Rx   7FF  Name  1 0 9 12 01 02 03 04 05 06 07 08 09 0A 0B 0C  0 0 3000 0 0 0 0 0\nEnd TriggerBlock\n")
+seed("asc", "decimal", "base dec  timestamps relative\n0.1 1 291 Rx d 2 255 16\n0.2 1 291x Tx r\n")
+seed("asc", "candump", "(1.5) can0 123#AABB T\n(1.6) vcan1 00000123##1CC\n")
+
 # --- Modbus ----------------------------------------------------------------------------------------------------
 
 REQUESTS = {

@@ -64,7 +64,8 @@ impl Context {
     pub fn observer(root: &Path) -> Result<Self, RailError> {
         let stack = load(root)?;
         let pid = std::process::id();
-        Self::join(root, stack, &format!("pid {pid}"), 0x8000_0000 | pid, 1, BTreeMap::new())
+        let generation = observer_generation(crate::clock::mono_ns());
+        Self::join(root, stack, &format!("pid {pid}"), 0x8000_0000 | pid, generation, BTreeMap::new())
     }
 
     fn join(
@@ -233,6 +234,12 @@ impl Context {
     }
 }
 
+/// A tool is known by its process id, and ids come again: a later tool is a later generation, or its first
+/// messages would be taken for old ones. Steps of 2^24 ns (17 ms), so that it wraps after 2.2 years of uptime.
+fn observer_generation(mono_ns: u64) -> u32 {
+    ((mono_ns >> 24) as u32).max(1)
+}
+
 /// Reads the resolved stack of a root.
 pub fn load(root: &Path) -> Result<Rc<Stack>, RailError> {
     let path = root.join(STACK_FILE);
@@ -244,4 +251,19 @@ pub fn load(root: &Path) -> Result<Rc<Stack>, RailError> {
 
 fn find<'a>(stack: &'a Stack, topic: &str) -> Result<&'a TopicEntry, RailError> {
     stack.topic(topic).ok_or_else(|| RailError::UnknownTopic(topic.to_owned()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_later_tool_is_a_later_generation() {
+        let second = 1_000_000_000;
+        assert!(observer_generation(0) >= 1);
+        // Two years of uptime still fit.
+        let times = [0, 20_000_000, second, 86_400 * second, 2 * 365 * 86_400 * second];
+        assert!(times.windows(2).all(|t| observer_generation(t[0]) < observer_generation(t[1]) || t[0] == 0));
+        assert!(observer_generation(20_000_000) <= observer_generation(40_000_000));
+    }
 }

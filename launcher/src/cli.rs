@@ -1,5 +1,6 @@
 //! The command line: `dinrail NOUN VERB`, or a plain verb for what is used daily.
 
+use crate::commands::can::args::CanCommand;
 use crate::supervise::service_main::ServiceArgs;
 use clap::{Args, Parser, Subcommand};
 use ipc_types::units::Span;
@@ -47,8 +48,24 @@ pub enum Command {
     Down(Which),
     /// List the services of a running stack
     Ps(Which),
-    /// How a running stack is
-    Status(Which),
+    /// How a running stack is, and what its services tell about themselves
+    Status {
+        /// Services; all of them when left out
+        services: Vec<String>,
+        /// Again every second
+        #[arg(short, long)]
+        watch: bool,
+        #[command(flatten)]
+        which: Which,
+    },
+    /// Processes, buses, PLCs, clients and events of a running stack, live
+    Top {
+        /// Time between two refreshes
+        #[arg(long, default_value = "1s", value_name = "DURATION")]
+        every: Span,
+        #[command(flatten)]
+        which: Which,
+    },
     /// What services printed
     Logs {
         /// Service; all of them when left out
@@ -68,7 +85,7 @@ pub enum Command {
         #[command(flatten)]
         which: Which,
     },
-    /// See and send CAN frames
+    /// See, send, generate and replay CAN frames
     #[command(subcommand)]
     Can(CanCommand),
     /// Control a PLC, read and change its variables
@@ -165,33 +182,6 @@ pub enum Command {
 }
 
 #[derive(Debug, Subcommand)]
-pub enum CanCommand {
-    /// Print frames as they are on the bus, one `candump -L` line each
-    Dump {
-        /// CAN service of the stack
-        bus: String,
-        /// Stop after so many frames
-        #[arg(long)]
-        count: Option<u64>,
-        /// Stop after so long
-        #[arg(long = "for", value_name = "DURATION")]
-        duration: Option<Span>,
-        #[command(flatten)]
-        which: Which,
-    },
-    /// Send frames and wait until they were on the bus
-    Send {
-        /// CAN service of the stack
-        bus: String,
-        /// 123#DEADBEEF, 12345678#00, 123#R4, 123##1AABB
-        #[arg(required = true)]
-        frames: Vec<String>,
-        #[command(flatten)]
-        which: Which,
-    },
-}
-
-#[derive(Debug, Subcommand)]
 pub enum PlcCommand {
     /// State, scans, cycle times, forces
     Status,
@@ -263,4 +253,8 @@ pub enum RecordingsCommand {
         #[arg(required = true)]
         files: Vec<PathBuf>,
     },
+    /// Write the CAN frames of a recording or log as a candump log or Vector ASC
+    Export(crate::commands::recordings::convert::ExportArgs),
+    /// Make a recording of a candump log or Vector ASC
+    Import(crate::commands::recordings::convert::ImportArgs),
 }

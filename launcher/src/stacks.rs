@@ -20,11 +20,18 @@ macro_rules! files {
 }
 
 /// Every ready stack. A test compares the list with the folders.
-pub static STACKS: &[ReadyStack] = &[ReadyStack {
-    name: "demo",
-    about: "a conveyor's CAN bus, a program, Modbus TCP and a recorder",
-    files: files!("demo": "README.md", "conveyor.log", "main.st", "stack.toml"),
-}];
+pub static STACKS: &[ReadyStack] = &[
+    ReadyStack {
+        name: "can-to-modbus",
+        about: "a CAN interface of the kernel, a program, Modbus TCP and a recorder",
+        files: files!("can-to-modbus": "README.md", "main.st", "stack.toml"),
+    },
+    ReadyStack {
+        name: "demo",
+        about: "a conveyor's CAN bus, a program, Modbus TCP and a recorder",
+        files: files!("demo": "README.md", "conveyor.log", "main.st", "stack.toml"),
+    },
+];
 
 /// The ready stack of this name.
 pub fn find(name: &str) -> Option<&'static ReadyStack> {

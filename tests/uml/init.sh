@@ -1,6 +1,7 @@
 #!/bin/bash
 # First process of a Linux that runs as an ordinary program (user-mode Linux) with the host's files as its root.
-# The kernel's command line hands over: WORK = folder for results, DINRAIL = the executable, SCRIPT = what to run.
+# The kernel's command line hands over: WORK = folder for results, DINRAIL = the executable, PYTHON = a python with the
+# peers, SCRIPT = what to run.
 # There is no exit code: the script writes what it finds to WORK, and WORK/done says that it came to its end.
 export PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
 export HOME=/tmp
@@ -17,6 +18,10 @@ for module in net/can/can net/can/can-raw net/can/can-bcm drivers/net/can/dev/ca
     insmod "$modules/$module.ko" 2>>"$WORK/insmod.log"
 done
 ip link add dev vcan0 type vcan mtu 72 && ip link set vcan0 up && touch "$WORK/booted"
+# What a stack needs of its temporary folder.
+cp /bin/true /tmp/exec-check && /tmp/exec-check && rm /tmp/exec-check && touch "$WORK/exec"
+UML=$(dirname "$SCRIPT")
+export UML
 bash "$SCRIPT" >"$WORK/script.log" 2>&1
 echo "$?" >"$WORK/done"
 sync

@@ -15,6 +15,20 @@ interface = "vcan0"
 serve = { socketcand = "127.0.0.1:29536" }
 
 [[service]]
+name = "some"
+kind = "can"
+backend = "socketcan"
+interface = "vcan0"
+filters = ["5A0:7F0", "1F000000:1FFFFF00"]
+
+[[service]]
+name = "kern"
+kind = "can"
+backend = "socketcan"
+interface = "kslcan"
+bitrate = "250k"
+
+[[service]]
 name = "gone"
 kind = "can"
 backend = "socketcan"
@@ -40,11 +54,11 @@ serve = { slcan_pty = "slcan2" }
 STACK
 
 say() { echo "--- $(date +%s.%N) $*"; }
-# Waits until a command succeeds; 60 s.
+# Waits until a command succeeds; at least two minutes.
 until_ok() {
     local what=$1 i
     shift
-    for i in $(seq 600); do
+    for i in $(seq 1200); do
         if "$@" >/dev/null 2>&1; then say "ok: $what"; return 0; fi
         sleep 0.1
     done
@@ -58,6 +72,7 @@ lines() { [ "$(wc -l <"$1")" -ge "$2" ]; }
 
 "$DINRAIL" up stack.toml >"$WORK/up.log" 2>&1 &
 until_ok "the driver works" is can0 ready
+until_ok "the driver with filters works" is some ready
 until_ok "a missing interface does not stop the stack" is gone degraded
 until_ok "the serial adapter works" is adapter ready
 
@@ -80,10 +95,26 @@ cansend vcan0 456#R2
 cansend vcan0 20000204#0020000000008000
 cansend vcan0 20000040#0000000000000000
 cansend vcan0 20000100#0000000000000000
+cansend vcan0 20000020#0000000000000000
 cansend vcan0 00000777#01
 until_ok "the stack saw them" grep -q '00000777#01' "$WORK/own.dump"
 sleep 0.5
 kill $own $dump
+
+say "filters in the kernel"
+"$DINRAIL" can dump some >"$WORK/some.dump" 2>&1 &
+dump=$!
+"$DINRAIL" can dump can0 >"$WORK/all.dump" 2>&1 &
+all=$!
+sleep 1
+for frame in 5A1#01 123#02 1F0000AA#03 000005A1#04 5AF#R2 5B0#05 1F0001AA#06 20000080#0000000000000000; do
+    cansend vcan0 "$frame"
+done
+# Its own frames have an echo of the kernel when they pass the filters, and one of the driver when they do not.
+"$DINRAIL" can send some 5A2#0A 124#0B >"$WORK/some.send" 2>&1
+until_ok "the other driver saw all" grep -q '124#0B' "$WORK/all.dump"
+until_ok "the driver with filters saw its own" grep -q '124#0B' "$WORK/some.dump"
+kill $dump $all
 
 say "$COUNT frames each way at 2000/s"
 python3 - "$COUNT" >in.log <<'PY'
@@ -146,6 +177,34 @@ ip link add dev vcan0 type vcan mtu 72
 until_ok "back" is can0 ready
 "$DINRAIL" can send can0 "00C#01" >>"$WORK/up.send" 2>&1
 kill $dump
+
+say "a controller: bit rate by netlink, bus-off, pulled and plugged in"
+plug() {
+    python3 "$UML/fake_adapter.py" /tmp/fake "$WORK/fake.log" &
+    fake=$!
+    until_ok "the adapter's terminal" test -e /tmp/fake
+    slcand -F "$(readlink /tmp/fake)" kslcan >>"$WORK/slcand.log" 2>&1 &
+    slcand=$!
+}
+for round in 1 2; do
+    plug
+    until_ok "interface raised $round" is kern ready
+    ip -details link show kslcan >"$WORK/kslcan.$round"
+    "$DINRAIL" can send kern "10$round#01" >>"$WORK/kern.send" 2>&1
+    until_ok "on the adapter $round" grep -q "^t10${round}101" "$WORK/fake.log"
+    if [ $round = 1 ]; then
+        "$DINRAIL" can send kern 666#02 >>"$WORK/kern.send" 2>&1
+        until_ok "bus-off seen" grep -q "kslcan is bus-off" "$WORK/up.log"
+        until_ok "opened again" sh -c "[ \$(grep -c '^O\$' $WORK/fake.log) -ge 2 ]"
+        until_ok "restarted" is kern ready
+        "$DINRAIL" can send kern 200#03 >>"$WORK/kern.send" 2>&1
+        until_ok "works again" grep -q '^t200103' "$WORK/fake.log"
+    fi
+    kill $slcand; wait $slcand 2>/dev/null
+    kill $fake; wait $fake 2>/dev/null
+    rm -f /tmp/fake
+    until_ok "pulled $round" is kern degraded
+done
 
 say "slcand on our terminal"
 "$DINRAIL" can dump virt >"$WORK/virt.dump" 2>&1 &

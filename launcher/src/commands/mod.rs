@@ -3,7 +3,7 @@
 
 pub mod bench;
 mod build;
-mod can;
+pub mod can;
 mod check;
 mod down;
 mod explain;
@@ -12,9 +12,11 @@ mod map;
 mod new;
 mod plc;
 mod ps;
-mod recordings;
+pub mod recordings;
 mod replay;
 mod restart;
+mod status;
+mod top;
 mod trace;
 mod up;
 
@@ -42,12 +44,15 @@ pub fn run(cli: Cli) -> ExitCode {
         Command::Demo { duration, dir } => up::demo(&dir, duration, json),
         Command::Down(which) => done(down::run(&which, json)),
         Command::Ps(which) => done(ps::run(&which, json)),
-        Command::Status(which) => ps::status(&which, json),
+        Command::Status { services, watch, which } => {
+            status::run(&which, &status::Wanted { services: &services, watch, json })
+        }
+        Command::Top { every, which } => done(top::run(which.stack.as_deref(), every.duration())),
         Command::Logs { service, follow, lines, which } => {
             done(logs::run(service.as_deref(), lines, follow, &which, json))
         }
         Command::Restart { service, which } => done(restart::run(&service, &which, json)),
-        Command::Can(command) => done(can::run(command, json)),
+        Command::Can(command) => can::run(command, json),
         Command::Plc { service, stack, command } => {
             done(plc::run(service.as_deref(), stack.as_deref(), command, json))
         }

@@ -2,9 +2,11 @@
 
 use super::{UsageError, println};
 use crate::cli::PlcCommand;
-use crate::supervise::client::{find, observe};
-use ipc_types::payload::{Job, JobResult};
-use ipc_types::port::{Publisher, Subscriber};
+use crate::supervise::client::{Client, find, observe};
+use crate::supervise::control::{Reply, Request, ServiceRow};
+use crate::supervise::state_dir::RunningStack;
+use ipc_types::payload::{Health, Job, JobResult};
+use ipc_types::port::{Publisher, SendError, Subscriber};
 use ipc_types::topic::TopicKind;
 use ipc_types::{Context, clock};
 use serde_json::{Value, json};
@@ -14,6 +16,10 @@ use std::time::{Duration, Instant};
 /// How long a job may take.
 const LIMIT: Duration = Duration::from_secs(5);
 const LOOK: Duration = Duration::from_millis(1);
+/// The launcher answers at once; it waits for nothing.
+const LAUNCHER_LIMIT: Duration = Duration::from_secs(2);
+/// So often the launcher is asked whether the plc is still to come back.
+const ASK_LAUNCHER: Duration = Duration::from_millis(250);
 
 pub fn run(
     service: Option<&str>,
@@ -22,12 +28,13 @@ pub fn run(
     json: bool,
 ) -> anyhow::Result<()> {
     let mut jobs = jobs_of(&command)?;
-    let mut ctx = observe(&find(stack)?)?;
+    let running = find(stack)?;
+    let mut ctx = observe(&running)?;
     for job in &mut jobs {
         name_as_stack_does(job, &ctx.stack.dir);
     }
     let plc = choose(&ctx, service)?;
-    let mut line = Line::open(&mut ctx, &plc)?;
+    let mut line = Line::open(&mut ctx, running, &plc)?;
     for job in jobs {
         let answer = line.ask(&job)?;
         if json {
@@ -120,53 +127,140 @@ fn choose(ctx: &Context, named: Option<&str>) -> anyhow::Result<String> {
     }
 }
 
+/// When a job is to be sent. Sans-I/O: a plc that dies takes its unread jobs along, so they are sent again to its
+/// successor.
+#[derive(Debug, Default)]
+struct Sending {
+    /// Generation of the plc that got the job.
+    to: Option<u32>,
+}
+
+impl Sending {
+    /// Whether the job must be sent to a plc of this generation.
+    fn is_due(&self, generation: u32) -> bool {
+        self.to.is_none_or(|to| generation > to)
+    }
+
+    fn sent(&mut self, generation: u32) {
+        self.to = Some(generation);
+    }
+}
+
+/// Why no answer can come, from the plc's row of `ps`.
+fn hopeless(row: Option<&ServiceRow>) -> Option<String> {
+    let row = row?;
+    matches!(row.state.as_str(), "held" | "ended" | "stopping").then(|| {
+        let way = if row.state == "held" {
+            format!("; `dinrail logs {0}` says why, `dinrail restart {0}` starts it again", row.service)
+        } else {
+            String::new()
+        };
+        format!("plc '{}' is {}{way}", row.service, row.state)
+    })
+}
+
 /// The way to a plc service and back. One a process: the numbers of its jobs count up.
 struct Line {
     plc: String,
     writer: u32,
     jobs: Publisher<Job>,
     results: Subscriber<JobResult>,
+    health: Subscriber<Health>,
+    running: RunningStack,
+    /// Newest generation of the plc that is known.
+    generation: u32,
 }
 
 impl Line {
-    fn open(ctx: &mut Context, plc: &str) -> anyhow::Result<Self> {
+    fn open(ctx: &mut Context, running: RunningStack, plc: &str) -> anyhow::Result<Self> {
         // First the ear, then the mouth: the answer may come at once.
         let results = ctx.subscriber::<JobResult>(&TopicKind::Results.of(plc))?;
+        let health = ctx.subscriber::<Health>(&TopicKind::Health.of(plc))?;
         let jobs = ctx.publisher::<Job>(&TopicKind::Jobs.of(plc))?;
-        Ok(Self { plc: plc.to_owned(), writer: ctx.writer, jobs, results })
+        let mut line =
+            Self { plc: plc.to_owned(), writer: ctx.writer, jobs, results, health, running, generation: 0 };
+        line.ask_launcher()?;
+        Ok(line)
     }
 
-    /// Sends a job and waits for its result.
-    fn ask(&mut self, job: &Value) -> anyhow::Result<Value> {
-        let plc = &self.plc;
-        let header = Job { deadline_t_ns: clock::mono_ns() + LIMIT.as_nanos() as u64, ..Job::default() };
-        let seq = self.jobs.send_tail(header, &serde_json::to_vec(job)?)?;
-        self.jobs.ring();
-        let begin = Instant::now();
-        loop {
-            let mut answer = None;
-            self.results.drain(64, |result, tail| {
-                if result.job_seq == seq && result.job_writer == self.writer {
-                    answer =
-                        Some((result.code, serde_json::from_slice::<Value>(tail).unwrap_or(Value::Null)));
-                }
-            });
-            match answer {
-                Some((0, body)) => return Ok(body.get("ok").cloned().unwrap_or(body)),
-                Some((code, body)) => {
-                    let error = body.get("error").and_then(Value::as_str).unwrap_or(match code {
-                        2 => "it came too late",
-                        3 => "not supported",
-                        _ => "it failed",
-                    });
-                    anyhow::bail!("plc '{plc}': {error}");
-                }
-                None if begin.elapsed() > LIMIT => {
-                    anyhow::bail!("plc '{plc}' did not answer within {} s; see `dinrail ps`", LIMIT.as_secs())
-                }
-                None => std::thread::sleep(LOOK),
-            }
+    /// Which generation runs now; an error when none will come.
+    fn ask_launcher(&mut self) -> anyhow::Result<()> {
+        let mut client = Client::connect(self.running.clone())?;
+        let Reply::Ps(rows) = client.call(&Request::Ps {}, LAUNCHER_LIMIT)? else {
+            anyhow::bail!("the launcher gave another answer than asked for; is it of another version?");
+        };
+        let row = rows.iter().find(|row| row.service == self.plc);
+        if let Some(why) = hopeless(row) {
+            anyhow::bail!("{why}");
         }
+        self.generation = self.generation.max(row.map_or(0, |row| row.generation));
+        Ok(())
+    }
+
+    /// Sends a job and waits for its result. A plc that is restarted meanwhile gets it again.
+    fn ask(&mut self, job: &Value) -> anyhow::Result<Value> {
+        let text = serde_json::to_vec(job)?;
+        let (mut sending, mut sent) = (Sending::default(), Vec::new());
+        let begin = Instant::now();
+        let mut asked_launcher = begin;
+        let mut refused = None;
+        while begin.elapsed() <= LIMIT {
+            let generation = &mut self.generation;
+            self.health.newest(|health, _| *generation = (*generation).max(health.stamp.generation));
+            if sending.is_due(self.generation) {
+                let left = LIMIT.saturating_sub(begin.elapsed());
+                let header =
+                    Job { deadline_t_ns: clock::mono_ns() + left.as_nanos() as u64, ..Job::default() };
+                match self.jobs.send_tail(header, &text) {
+                    Ok(seq) => {
+                        self.jobs.ring();
+                        sending.sent(self.generation);
+                        sent.push(seq);
+                    }
+                    // It starts, or it has much to do: it will read again.
+                    Err(e @ (SendError::NoReader(_) | SendError::Full(_))) => refused = Some(e),
+                    Err(e) => return Err(e.into()),
+                }
+            }
+            if let Some(answer) = self.answer(&sent) {
+                return answer;
+            }
+            if asked_launcher.elapsed() >= ASK_LAUNCHER {
+                asked_launcher = Instant::now();
+                self.ask_launcher()?;
+            }
+            std::thread::sleep(LOOK);
+        }
+        match refused.filter(|_| sent.is_empty()) {
+            Some(refused) => Err(refused.into()),
+            None => anyhow::bail!(
+                "plc '{}' did not answer within {} s; see `dinrail ps`",
+                self.plc,
+                LIMIT.as_secs()
+            ),
+        }
+    }
+
+    /// The result of one of these jobs of ours, if it has come.
+    fn answer(&mut self, sent: &[u64]) -> Option<anyhow::Result<Value>> {
+        let (plc, writer) = (&self.plc, self.writer);
+        let mut answer = None;
+        self.results.drain(64, |result, tail| {
+            if result.job_writer == writer && sent.contains(&result.job_seq) {
+                answer = Some((result.code, serde_json::from_slice::<Value>(tail).unwrap_or(Value::Null)));
+            }
+        });
+        Some(match answer? {
+            (0, body) => Ok(body.get("ok").cloned().unwrap_or(body)),
+            (code, body) => {
+                let error = body.get("error").and_then(Value::as_str).unwrap_or(match code {
+                    2 => "it came too late",
+                    3 => "not supported",
+                    _ => "it failed",
+                });
+                Err(anyhow::anyhow!("plc '{plc}': {error}"))
+            }
+        })
     }
 }
 
@@ -218,6 +312,30 @@ mod tests {
             let message = assignment(text).unwrap_err().to_string();
             assert!(message.contains("write VAR=VALUE"), "{message}");
         }
+    }
+
+    #[test]
+    fn a_job_goes_once_to_each_generation() {
+        let mut sending = Sending::default();
+        assert!(sending.is_due(1));
+        sending.sent(1);
+        // A heartbeat of a process before it, from the queue of a dead writer.
+        assert!(!sending.is_due(1) && !sending.is_due(0) && sending.is_due(2));
+        sending.sent(2);
+        assert!(!sending.is_due(2));
+    }
+
+    #[test]
+    fn a_plc_that_will_not_come_back_is_told_at_once() {
+        let mut row = super::super::top::tests::row("plc", "plc");
+        assert_eq!(hopeless(Some(&row)), None);
+        row.state = "back-off".into();
+        assert_eq!(hopeless(Some(&row)), None);
+        row.state = "held".into();
+        let why = hopeless(Some(&row)).unwrap();
+        assert!(why.starts_with("plc 'plc' is held; ") && why.contains("`dinrail restart plc`"), "{why}");
+        row.state = "stopping".into();
+        assert_eq!(hopeless(Some(&row)).unwrap(), "plc 'plc' is stopping");
     }
 
     #[test]

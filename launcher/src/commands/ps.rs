@@ -1,10 +1,9 @@
-//! `dinrail ps` and `dinrail status`.
+//! `dinrail ps`.
 
 use super::table;
 use crate::cli::Which;
 use crate::supervise::client::{Client, find};
 use crate::supervise::control::{Reply, Request, ServiceRow, StackStatus};
-use std::process::ExitCode;
 use std::time::Duration;
 
 const LIMIT: Duration = Duration::from_secs(10);
@@ -45,7 +44,7 @@ fn rows_text(rows: &[ServiceRow]) -> String {
 }
 
 /// `950 ms`, `12 s`, `3 min 5 s`, `2 h 7 min`, `4 d 3 h`.
-fn uptime(ms: u64) -> String {
+pub fn uptime(ms: u64) -> String {
     let s = ms / 1000;
     match s {
         0 => format!("{ms} ms"),
@@ -56,39 +55,13 @@ fn uptime(ms: u64) -> String {
     }
 }
 
-/// The stack as a whole; exit code 1 unless it is running or starting.
-pub fn status(which: &Which, json: bool) -> anyhow::Result<ExitCode> {
+/// The stack as a whole, from its launcher alone.
+pub fn fetch_status(which: &Which) -> anyhow::Result<StackStatus> {
     let mut client = Client::connect(find(which.stack.as_deref())?)?;
     let Reply::Status(status) = client.call(&Request::Status {}, LIMIT)? else {
         anyhow::bail!("the launcher gave another answer than asked for; is it of another version?");
     };
-    if json {
-        super::println(&serde_json::to_string_pretty(&status)?);
-    } else {
-        super::println(&status_text(&status));
-    }
-    let well = matches!(status.state.as_str(), "running" | "starting");
-    Ok(if well { ExitCode::SUCCESS } else { ExitCode::FAILURE })
-}
-
-fn status_text(s: &StackStatus) -> String {
-    let mut text = format!(
-        "stack '{}' is {}, launcher pid {}, up {}, {} of {} services ready, build {}",
-        s.stack,
-        s.state,
-        s.pid,
-        uptime(s.uptime_ms),
-        s.ready,
-        s.services,
-        s.build_id
-    );
-    if !s.held.is_empty() {
-        text += &format!("\nheld after too many restarts: {}", s.held.join(", "));
-    }
-    if let Some(why) = &s.failed {
-        text += &format!("\nfailed: {why}");
-    }
-    text
+    Ok(status)
 }
 
 #[cfg(test)]

@@ -51,6 +51,12 @@ pub const CAN: &[KeyDoc] = &[
         "\"4MiB\"",
         "socketcan: receive buffer of the socket, 64KiB to 64MiB; without CAP_NET_ADMIN at most net.core.rmem_max.",
     ),
+    with(
+        "filters",
+        OneOf(&[Choice(&["none", "auto"]), List(&Text)]),
+        "\"none\"",
+        "socketcan: frames that the kernel hands over: \"none\" filters nothing; \"auto\" takes the identifiers that the readers of the bus name, if all do; a list such as [\"1A0\", \"18FEF100:1FFFFF00\"] takes these, at most 512. What is kept back is in no recording and no dump.",
+    ),
     with("baud", Int(9600, 3_000_000), "115200", "slcan: rate of the serial device; USB adapters ignore it."),
     with("timestamps", Bool, "false", "slcan: stamp frames by the adapter's clock instead of their arrival."),
     with(

@@ -72,7 +72,8 @@ fn report(error: &Error, table: &Table, scope: &Scope<'_>, sink: &mut Sink<'_>) 
         let parent = path.rsplit_once('.').map_or("", |(parent, _)| parent);
         let mut keys: Vec<&str> = quoted.iter().skip(1).copied().collect();
         if parent.is_empty() {
-            keys.extend(scope.more_keys);
+            // `exec` is known only to be refused: nobody is to be led to it.
+            keys.extend(scope.more_keys.iter().filter(|key| **key != "exec"));
         }
         let place = if parent.is_empty() { what.to_owned() } else { format!("{what}, table '{parent}'") };
         sink.error(

@@ -3,7 +3,7 @@
 use super::control::{Reply, Request};
 use super::state_dir::{self, RunningStack, SOCKET};
 use ipc_types::rail::RailError;
-use ipc_types::{Context, clock};
+use ipc_types::Context;
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
 use std::time::Duration;
@@ -48,11 +48,7 @@ fn choose(mut running: Vec<RunningStack>, name: Option<&str>) -> Result<RunningS
 
 /// Joins the rail of a running stack as a tool. Once a process.
 pub fn observe(stack: &RunningStack) -> Result<Context, RailError> {
-    let mut ctx = Context::observer(&stack.root)?;
-    // A tool is known by its process id, and ids come again: a later tool is a later generation, or its first
-    // messages would be taken for old ones.
-    ctx.generation = ((clock::mono_ns() / 1_000_000) as u32).max(2);
-    Ok(ctx)
+    Context::observer(&stack.root)
 }
 
 /// A connection to a launcher.

@@ -386,7 +386,10 @@ impl Policy {
         let slot = &mut self.slots[service];
         slot.phase = Phase::Held;
         let within_s = slot.rule.within_ns as f64 / 1e9;
-        let budget = format!("the budget of {} restarts in {within_s} s is used up", slot.rule.max);
+        let budget = match slot.rule.max {
+            0 => "it ended, and `restart = { max = 0 }` allows no restart".to_owned(),
+            max => format!("the budget of {max} restarts in {within_s} s is used up"),
+        };
         let (name, on_exhausted) = (slot.name.clone(), slot.rule.on_exhausted);
         self.out.push(Action::CloseListeners { service });
         match on_exhausted {

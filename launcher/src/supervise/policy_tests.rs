@@ -162,7 +162,7 @@ fn an_exhausted_budget_can_fail_the_stack() {
     );
     p.died(1, death(), S);
     assert_eq!(done(&mut p), [Action::Ended]);
-    assert_eq!(p.failed(), Some("service 'can0': the budget of 0 restarts in 10 s is used up"));
+    assert_eq!(p.failed(), Some("service 'can0': it ended, and `restart = { max = 0 }` allows no restart"));
 }
 
 #[test]

@@ -145,9 +145,10 @@ fn serve(
         held.push(rail::create_inbox(&node, &service.name, stack.services.len() as u32)?);
     }
     let mut ctx = Context::observer(&stack.root)?;
-    // The launcher is writer 0 of the rail.
+    // The launcher is writer 0 of the rail, and the rail's only launcher.
     ctx.service = "launcher".to_owned();
     ctx.writer = 0;
+    ctx.generation = 1;
     let mut post = Post { events: ctx.publisher::<Event>(EVENTS)?, told: false };
     let mut outbox = Outbox::new(stack);
     let mut pulses = Vec::with_capacity(stack.services.len());

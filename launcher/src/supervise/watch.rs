@@ -21,9 +21,9 @@ const EVENTS_MAX: usize = 256;
 /// A picture of the stack.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Observed {
-    /// Buses: name and frames since the driver's start.
+    /// Buses: name and frames since the stack's start, over all restarts of the driver.
     pub buses: Vec<(String, u64)>,
-    /// PLCs: name, state, scans.
+    /// PLCs: name, state, scans over all restarts.
     pub plcs: Vec<(String, PlcState, u64)>,
     /// Points of the image with their values.
     pub points: Vec<(String, String)>,
@@ -33,10 +33,32 @@ pub struct Observed {
     pub losses: Vec<String>,
 }
 
+/// A count that begins anew with every process of its service, summed up over all of them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+struct Total {
+    before: u64,
+    generation: u32,
+    now: u64,
+}
+
+impl Total {
+    fn follow(&mut self, generation: u32, count: u64) {
+        if generation != self.generation {
+            self.before += self.now;
+            self.generation = generation;
+        }
+        self.now = count;
+    }
+
+    fn sum(self) -> u64 {
+        self.before + self.now
+    }
+}
+
 struct Bus {
     name: String,
     rx: Subscriber<CanFrame>,
-    frames: u64,
+    frames: Total,
 }
 
 struct Plc {
@@ -44,7 +66,7 @@ struct Plc {
     image: Subscriber<Image>,
     points: Vec<ImageRange>,
     state: PlcState,
-    scans: u64,
+    scans: Total,
     values: Vec<(String, String)>,
 }
 
@@ -81,7 +103,7 @@ impl Observer {
             let name = service.name.clone();
             if busy && owns(TopicKind::CanRx) {
                 let rx = ctx.subscriber(&TopicKind::CanRx.of(&name))?;
-                this.buses.push(Bus { name: name.clone(), rx, frames: 0 });
+                this.buses.push(Bus { name: name.clone(), rx, frames: Total::default() });
             }
             if busy && owns(TopicKind::Image) {
                 let image = ctx.subscriber(&TopicKind::Image.of(&name))?;
@@ -90,7 +112,7 @@ impl Observer {
                     name: name.clone(),
                     image,
                     state: PlcState::Starting,
-                    scans: 0,
+                    scans: Total::default(),
                     values: Vec::new(),
                 });
             }
@@ -115,7 +137,7 @@ impl Observer {
             }
         });
         for bus in &mut self.buses {
-            bus.rx.newest(|frame, _| bus.frames = frame.stamp.seq);
+            bus.rx.newest(|frame, _| bus.frames.follow(frame.stamp.generation, frame.stamp.seq));
         }
         let now = Instant::now();
         if now < self.next && !last {
@@ -125,7 +147,7 @@ impl Observer {
         for plc in &mut self.plcs {
             plc.image.newest(|image, tail| {
                 plc.state = image.plc_state();
-                plc.scans = image.scan;
+                plc.scans.follow(image.stamp.generation, image.scan);
                 plc.values =
                     plc.points.iter().filter_map(|p| Some((label(p), value(image, tail, p)?))).collect();
             });
@@ -138,8 +160,8 @@ impl Observer {
             });
         }
         Some(Observed {
-            buses: self.buses.iter().map(|b| (b.name.clone(), b.frames)).collect(),
-            plcs: self.plcs.iter().map(|p| (p.name.clone(), p.state, p.scans)).collect(),
+            buses: self.buses.iter().map(|b| (b.name.clone(), b.frames.sum())).collect(),
+            plcs: self.plcs.iter().map(|p| (p.name.clone(), p.state, p.scans.sum())).collect(),
             points: self.plcs.iter().flat_map(|p| p.values.iter().cloned()).take(POINTS_MAX).collect(),
             recorders: self.recorders.iter().map(|r| (r.name.clone(), r.last.clone())).collect(),
             losses: self.losses.clone(),
@@ -176,14 +198,19 @@ fn points_of(stack: &ipc_types::Stack, plc: &str) -> Vec<ImageRange> {
 }
 
 fn label(point: &ImageRange) -> String {
-    match (&point.symbol, point.bit) {
-        (Some(symbol), _) => symbol.clone(),
-        (None, Some(bit)) => format!("%{}X{}.{bit}", point.area.letter(), point.byte),
-        (None, None) => format!("%{}B{}", point.area.letter(), point.byte),
+    point.symbol.clone().unwrap_or_else(|| address(point))
+}
+
+/// Where a point lies, in bytes: the one notation that is the same for every way of counting.
+pub fn address(point: &ImageRange) -> String {
+    match point.bit {
+        Some(bit) => format!("%{}X{}.{bit}", point.area.letter(), point.byte),
+        None => format!("%{}B{}", point.area.letter(), point.byte),
     }
 }
 
-fn value(image: &Image, tail: &[u8], point: &ImageRange) -> Option<String> {
+/// The value of a point as text; `None` when the image has no such bytes.
+pub fn value(image: &Image, tail: &[u8], point: &ImageRange) -> Option<String> {
     let (input, output, marker) = image.areas(tail)?;
     let area = match point.area {
         Area::Input => input,
@@ -215,6 +242,16 @@ fn render(type_name: &str, bit: Option<u8>, bytes: &[u8]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn counts_go_on_over_restarts() {
+        let mut total = Total::default();
+        // A new process shows its image before its first scan.
+        for (generation, count, sum) in [(1, 10, 10), (1, 90, 90), (2, 0, 90), (2, 5, 95), (4, 7, 102)] {
+            total.follow(generation, count);
+            assert_eq!(total.sum(), sum);
+        }
+    }
 
     #[test]
     fn values_are_shown_by_their_type() {

@@ -187,6 +187,14 @@ enum Unsafe {
 }
 
 impl Unsafe {
+    /// A stop is somebody's will, by `dinrail plc stop` or with the whole stack, and no fault.
+    fn level(self) -> Level {
+        match self {
+            Self::Stop => Level::Info,
+            Self::Waiting | Self::Stale | Self::Fault | Self::Halted => Level::Fault,
+        }
+    }
+
     fn text(self) -> &'static str {
         match self {
             Self::Waiting => "the PLC has not finished a scan yet",
@@ -445,7 +453,7 @@ impl Service {
                     let message = format!("outputs went to their safe state: {}", why.text());
                     self.ctx.event(
                         EventKind::SafeEntered,
-                        Level::Fault,
+                        why.level(),
                         message,
                         serde_json::json!({ "why": why }),
                     );

@@ -128,4 +128,8 @@ fn verdicts() {
     assert_eq!(judge(PlcState::Fault, 5, &all), Some(Unsafe::Fault));
     assert_eq!(judge(PlcState::Halted, 5, &all), Some(Unsafe::Halted));
     assert_eq!(judge(PlcState::Halted, 5, &[SafeOn::Stop]), None);
+    assert_eq!(Unsafe::Stop.level(), Level::Info);
+    for fault in [Unsafe::Waiting, Unsafe::Stale, Unsafe::Fault, Unsafe::Halted] {
+        assert_eq!(fault.level(), Level::Fault, "{fault:?}");
+    }
 }

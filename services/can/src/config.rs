@@ -12,7 +12,8 @@ use crate::feed;
 use crate::protocol::slcan_client::{self, Channel};
 use crate::sys::BAUDS;
 use crate::virtual_bus::{CLIENT_QUEUE, Dialect, MAX_CLIENTS, Settings};
-use crate::wire::netlink::Wanted;
+use crate::wire::filter::{Filters, MAX_FILTERS};
+use crate::wire::netlink::{self, Wanted};
 use crate::wire::port::Target;
 
 /// What stands between this driver and the wire.
@@ -71,6 +72,10 @@ pub struct Config {
     /// Receive buffer of the socket, 64KiB - 64MiB. Default 4MiB: about 5,000 frames.
     #[serde(default = "default_rx_buffer")]
     pub rx_buffer: Size,
+    /// Frames that the kernel hands to the driver: "none" (every frame), "auto" (what the readers of the bus name),
+    /// or a list of at most 512. Default "none".
+    #[serde(default)]
+    pub filters: Filters,
     /// Rate of the serial device. Default 115200.
     #[serde(default = "default_baud")]
     pub baud: u32,
@@ -364,6 +369,20 @@ impl Config {
         if !(64 << 10..=64 << 20).contains(&self.rx_buffer.0) {
             error("rx_buffer", format!("rx_buffer {} is out of range", self.rx_buffer), "use 64KiB to 64MiB");
         }
+        match &self.filters {
+            Filters::List(list) if list.is_empty() || list.len() > MAX_FILTERS => error(
+                "filters",
+                format!("filters has {} entries", list.len()),
+                "use 1 to 512, or \"none\" for every frame",
+            ),
+            Filters::None => {}
+            _ if self.backend != Backend::Socketcan => error(
+                "filters",
+                format!("backend \"{}\" has no filters in the kernel", self.backend.name()),
+                "remove the key: every frame comes",
+            ),
+            _ => {}
+        }
         match (self.backend, self.interface.as_deref()) {
             (Backend::Virtual, _) => {}
             (Backend::Socketcan, None | Some("")) => error(
@@ -379,12 +398,18 @@ impl Config {
             (Backend::Socketcan, Some(name)) => {
                 let sys = std::path::Path::new("/sys/class/net");
                 if sys.is_dir() && !sys.join(name).exists() {
-                    found.push(Finding::warning(
-                        service,
-                        "interface",
-                        format!("this machine has no interface '{name}' now"),
-                        "the driver waits for it; `ip -brief link` lists what there is",
-                    ));
+                    let (message, help) = if netlink::supported() {
+                        (
+                            format!("this machine has no interface '{name}' now ({})", netlink::known()),
+                            format!("the driver waits for it; `ip link add dev {name} type vcan` makes one without hardware"),
+                        )
+                    } else {
+                        (
+                            format!("this machine has no interface '{name}', and its kernel no SocketCAN"),
+                            "load it with `modprobe can_raw`, or use backend = \"slcan\" for a serial adapter".to_owned(),
+                        )
+                    };
+                    found.push(Finding::warning(service, "interface", message, help));
                 }
             }
             (Backend::Slcan, _) => self.slcan_findings(&mut error),
@@ -554,6 +579,19 @@ mod tests {
         "#);
     }
 
+    /// What it says depends on the machine: whether its kernel has CAN, and which interfaces.
+    #[test]
+    fn an_interface_that_is_not_there() {
+        let said = said(json!({ "backend": "socketcan", "interface": "nocan42" }));
+        let (what, help) = if netlink::supported() {
+            ("' now (", "`ip link add dev nocan42 type vcan`")
+        } else {
+            ("', and its kernel no SocketCAN", "`modprobe can_raw`")
+        };
+        assert!(said.starts_with(&format!("Warning interface: this machine has no interface 'nocan42{what}")), "{said}");
+        assert!(said.contains(help), "{said}");
+    }
+
     #[test]
     fn mistakes() {
         let all = [
@@ -561,7 +599,8 @@ mod tests {
             said(
                 json!({ "backend": "socketcan", "interface": "/dev/ttyACM0", "bus_off_restart": "2min", "rx_buffer": "1KiB" }),
             ),
-            said(json!({ "backend": "socketcan", "interface": "nocan42" })),
+            said(json!({ "backend": "socketcan", "interface": "lo", "filters": [] })),
+            said(json!({ "backend": "virtual", "filters": "auto" })),
             said(
                 json!({ "backend": "slcan", "bitrate": "33k", "baud": 115_201, "fd": true, "data_bitrate": "2500k" }),
             ),
@@ -586,7 +625,8 @@ mod tests {
         Error bus_off_restart: bus_off_restart 2min is out of range -> use whole ms up to 60s; 0 = never
         Error rx_buffer: rx_buffer 1KiB is out of range -> use 64KiB to 64MiB
         Error interface: '/dev/ttyACM0' is no name of a network interface -> write e.g. "can0"; for a serial device use backend = "slcan"
-        Warning interface: this machine has no interface 'nocan42' now -> the driver waits for it; `ip -brief link` lists what there is
+        Error filters: filters has 0 entries -> use 1 to 512, or "none" for every frame
+        Error filters: backend "virtual" has no filters in the kernel -> remove the key: every frame comes
         Error interface: backend "slcan" needs a serial device or an address -> write e.g. interface = "/dev/ttyACM0" or "tcp://192.168.1.7:3333"; `ls /dev/serial/by-id` lists serial adapters
         Error bitrate: the SLCAN protocol has no bit rate 33k -> use 10k, 20k, 50k, 83300, 100k, 125k, 250k, 500k, 750k, 800k or 1M
         Error data_bitrate: the SLCAN protocol has no data bit rate 2500k -> use 1M to 8M in whole M; most adapters have 2M and 5M

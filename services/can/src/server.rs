@@ -13,7 +13,7 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use ipc_types::event::Level;
-use ipc_types::net::IpFilter;
+use ipc_types::net::{IpFilter, Seldom};
 use rustix::time::{Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec};
 use serde::Serialize;
 use tokio::io::Interest;
@@ -196,6 +196,7 @@ impl<H: Host + 'static> Hub<H> {
         filter: Option<IpFilter>,
         max_clients: usize,
     ) {
+        let mut seldom = Seldom::default();
         loop {
             match listener.accept().await {
                 Ok((stream, peer)) => match self.admit(peer, dialect, filter.as_ref(), max_clients) {
@@ -213,7 +214,9 @@ impl<H: Host + 'static> Hub<H> {
                 },
                 // Descriptors exhausted or the like: others must go first.
                 Err(e) => {
-                    tracing::warn!("accepting {dialect:?} clients: {e}");
+                    if let Some(untold) = seldom.failed(ipc_types::clock::mono_ns()) {
+                        tracing::warn!("accepting {} clients: {e} ({untold} more since last told)", dialect.name());
+                    }
                     tokio::time::sleep(Duration::from_millis(100)).await;
                 }
             }

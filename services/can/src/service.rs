@@ -25,6 +25,7 @@ use crate::server::{ClientStatus, Host, Hub};
 use crate::server_pty::Pty;
 use crate::txqueue::{Pushed, TxCounters};
 use crate::virtual_bus::{BusCounters, Origin, Tap, VirtualBus, WireCounters};
+use crate::wire::filter::{self, Filter, Filters};
 use crate::wire::{Line, LinkStatus, remote, socketcan};
 use crate::{protocol, watch};
 
@@ -99,7 +100,31 @@ pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
 
 /// Every mistake that can be found without starting.
 pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> {
-    config.findings(&me.name, &stack.dir)
+    let mut found = config.findings(&me.name, &stack.dir);
+    if let Err(why) = filters(config, stack, &me.name) {
+        found.push(Finding::warning(
+            &me.name,
+            "filters",
+            format!("filters = \"auto\" filters nothing: {why}"),
+            "remove the key, or list the identifiers",
+        ));
+    }
+    found
+}
+
+/// The filters for the kernel, none: every frame. Or why there can be none.
+fn filters(config: &Config, stack: &Stack, service: &str) -> Result<Vec<Filter>, String> {
+    match &config.filters {
+        Filters::None => Ok(Vec::new()),
+        Filters::List(list) => Ok(list.clone()),
+        Filters::Auto => match config.endpoints().first() {
+            Some((name, _)) => Err(format!("clients of serve.{name} take every frame")),
+            None if config.serve.slcan_pty.is_some() => {
+                Err("the client of serve.slcan_pty takes every frame".to_owned())
+            }
+            None => filter::derived(stack, service),
+        },
+    }
 }
 
 /// Runs until the launcher says stop.
@@ -368,8 +393,13 @@ fn attach(hub: &Rc<Hub<Rail>>, config: &Config) -> Result<Shared, RunError> {
         Backend::Virtual => return Ok(None),
         Backend::Socketcan => {
             flight(socketcan::FLIGHT);
-            let settings =
-                socketcan::Settings { wanted: config.wanted(), rx_buffer: config.rx_buffer.0 as usize };
+            let filters = hub.look(|_, rail| filters(config, &rail.ctx.stack, &rail.ctx.service));
+            let settings = socketcan::Settings {
+                wanted: config.wanted(),
+                rx_buffer: config.rx_buffer.0 as usize,
+                // Why there are none is said by `check`.
+                filters: filters.unwrap_or_default(),
+            };
             tokio::task::spawn_local(socketcan::drive(line, settings));
         }
         Backend::Slcan | Backend::Socketcand => {

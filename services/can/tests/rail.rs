@@ -6,47 +6,16 @@ use std::collections::BTreeMap;
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::os::fd::OwnedFd;
-use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+use ipc_types::Wiring;
 use ipc_types::payload::{CanFrame, Health, HealthState, Status, can_flag, fd_flag, id_flag};
 use ipc_types::port::{Publisher, SendError, Subscriber};
 use ipc_types::reactor::Reactor;
-use ipc_types::stack::{ServiceEntry, Stack, TopicEntry, Wake};
-use ipc_types::topic::{EVENTS, TopicKind};
+use ipc_types::testing::{PATIENCE, TestRail, join, service, topic, wait};
+use ipc_types::topic::TopicKind;
 use ipc_types::wiring::Neighbours;
-use ipc_types::{Context, Wiring, rail};
 use serde_json::json;
-
-/// Longest wait for anything; never a measure of speed.
-const PATIENCE: Duration = Duration::from_mins(1);
-
-fn topic(kind: TopicKind, service: &str, depth: u32, wake: Option<&str>) -> TopicEntry {
-    let (max_publishers, max_subscribers) = rail::port_limits(kind, 2, 2);
-    TopicEntry {
-        name: if kind == TopicKind::Events { EVENTS.to_owned() } else { kind.of(service) },
-        kind,
-        depth,
-        max_tail: kind.row().max_tail,
-        writers: vec![service.to_owned()],
-        readers: Vec::new(),
-        wakes: wake.map(|w| Wake { service: w.into(), event_id: 1 }).into_iter().collect(),
-        max_publishers,
-        max_subscribers,
-    }
-}
-
-struct Wipe(PathBuf, String);
-impl Drop for Wipe {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-        for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
-            if entry.file_name().to_string_lossy().starts_with(&self.1) {
-                let _ = std::fs::remove_file(entry.path());
-            }
-        }
-    }
-}
 
 struct Probe {
     reactor: Reactor,
@@ -90,11 +59,6 @@ fn expect(stream: &mut TcpStream, text: &str) {
 
 #[test]
 fn a_bus_on_the_rail() {
-    let name = format!("cantest{}", std::process::id());
-    let (root, prefix) = rail::place(0, &name);
-    let _wipe = Wipe(root.clone(), prefix.clone());
-    std::fs::create_dir_all(&root).unwrap();
-    std::fs::write(root.join(rail::CONFIG_FILE), rail::config_text(&root, &prefix)).unwrap();
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap();
     // At this rate a reader may sleep 0.4 s without loss: enough on any machine.
@@ -103,43 +67,18 @@ fn a_bus_on_the_rail() {
     let wiring = dinrail_can::topics(&serde_json::from_value(config.clone()).unwrap(), &neighbours);
     assert_eq!(wiring.listeners[0].name, "socketcand");
     let rx_depth = wiring.topics.iter().find(|t| t.kind == TopicKind::CanRx).unwrap().depth;
-    let service = |name: &str, index, config, wiring| ServiceEntry {
-        name: name.into(),
-        kind: "can".into(),
-        index,
-        config,
-        wiring,
-    };
-    let stack = Stack {
-        name,
-        file: "test".into(),
-        dir: ".".into(),
-        text: String::new(),
-        build_id: "test".into(),
-        root: root.clone(),
-        prefix,
-        services: vec![
-            service("can0", 1, config, wiring),
-            service("probe", 2, serde_json::Value::Null, Wiring::default()),
+    let rail = TestRail::new(
+        "cantest",
+        vec![
+            service("can0", "can", config, wiring),
+            service("probe", "can", serde_json::Value::Null, Wiring::default()),
         ],
-        topics: vec![
-            topic(TopicKind::Events, "stack", 16, None),
-            topic(TopicKind::Health, "can0", 4, None),
-            topic(TopicKind::Status, "can0", 4, None),
-            topic(TopicKind::Health, "probe", 4, None),
-            topic(TopicKind::Status, "probe", 4, None),
-            topic(TopicKind::CanRx, "can0", rx_depth, Some("probe")),
-            topic(TopicKind::CanTx, "can0", 1024, Some("can0")),
+        vec![
+            topic(TopicKind::CanRx, "can0").depth(rx_depth).wakes("probe", 1),
+            topic(TopicKind::CanTx, "can0").depth(1024).wakes("can0", 1),
         ],
-    };
-    std::fs::write(root.join(rail::STACK_FILE), serde_json::to_vec(&stack).unwrap()).unwrap();
-    rail::join(&root).unwrap();
-    let launcher = rail::node("launcher").unwrap();
-    let mut held: Vec<_> = stack.topics.iter().map(|t| rail::create_topic(&launcher, t).unwrap()).collect();
-    held.push(rail::create_inbox(&launcher, "probe", 4).unwrap());
-    held.push(rail::create_inbox(&launcher, "can0", 4).unwrap());
-
-    let mut ctx = Context::service(&root, "probe", 1, BTreeMap::new()).unwrap();
+    );
+    let mut ctx = rail.context("probe");
     let mut health = ctx.subscriber::<Health>("can0/health").unwrap();
     let mut status = ctx.subscriber::<Status>("can0/status").unwrap();
     let inbox = ctx.inbox().unwrap();
@@ -152,17 +91,13 @@ fn a_bus_on_the_rail() {
         reactor,
     };
     let fds = BTreeMap::from([("socketcand".to_owned(), OwnedFd::from(listener))]);
-    std::thread::spawn(move || {
-        let ctx = Context::service(&root, "can0", 1, fds).unwrap();
-        dinrail_can::run(ctx).unwrap();
-    });
-    let end = Instant::now() + PATIENCE;
-    let mut ready = false;
-    while !ready {
-        assert!(Instant::now() < end, "the driver never became ready");
+    let root = rail.root().to_owned();
+    std::thread::spawn(move || dinrail_can::run(join(&root, "can0", fds)).unwrap());
+    wait("the driver ready", || {
+        let mut ready = false;
         health.newest(|h, _| ready = h.state == HealthState::Ready as u32);
-        std::thread::sleep(Duration::from_millis(5));
-    }
+        ready.then_some(())
+    });
 
     // What a process of the stack sends comes back as echo, with data untouched, in all kinds.
     let fd = CanFrame {
@@ -203,13 +138,11 @@ fn a_bus_on_the_rail() {
     burst_of_a_process(&mut probe);
     burst_of_a_client(&mut probe, client);
 
-    let end = Instant::now() + PATIENCE;
     let mut text = String::new();
-    while !text.contains("\"tx_invalid\":1") || !text.contains("\"tx\":40004") {
-        assert!(Instant::now() < end, "{text}");
+    wait("the counters of all frames", || {
         status.newest(|_, tail| text = String::from_utf8_lossy(tail).into_owned());
-        std::thread::sleep(Duration::from_millis(20));
-    }
+        (text.contains("\"tx_invalid\":1") && text.contains("\"tx\":40004")).then_some(())
+    });
     assert!(text.contains("\"protocol\":\"socketcand\"") || text.contains("\"clients\":[]"), "{text}");
 }
 

@@ -29,6 +29,8 @@ pub(crate) struct Range {
     pub swap_bytes: bool,
     /// Whether the server owns these bytes of %I.
     pub own: bool,
+    /// Whether clients may not write it whatever it shows.
+    pub read_only: bool,
 }
 
 impl Range {
@@ -41,8 +43,8 @@ impl Range {
         if self.high_first { k - k % self.group + (self.group - 1 - k % self.group) } else { k }
     }
 
-    fn writable(&self) -> bool {
-        self.own || self.area != Area::Input
+    pub(crate) fn writable(&self) -> bool {
+        self.own || (self.area != Area::Input && !self.read_only)
     }
 }
 
@@ -60,12 +62,19 @@ pub struct Memory<'a> {
 }
 
 impl<'a> Memory<'a> {
-    fn of(&self, range: &Range) -> &'a [u8] {
-        match range.area {
-            Area::Input if range.own => self.own_input,
+    /// An area as the PLC has it.
+    pub fn area(&self, area: Area) -> &'a [u8] {
+        match area {
             Area::Input => self.input,
             Area::Output => self.output,
             Area::Marker => self.marker,
+        }
+    }
+
+    fn of(&self, range: &Range) -> &'a [u8] {
+        match range.area {
+            Area::Input if range.own => self.own_input,
+            area => self.area(area),
         }
     }
 }

@@ -37,6 +37,52 @@ pub enum WordOrder {
     HighFirst,
 }
 
+/// Order of the bytes of a value on the wire, A the most significant. A 16-bit value is AB or BA; of 32-bit values
+/// all four are in use, and 64-bit values follow the same two choices: which word comes first, and whether the bytes
+/// of each word are exchanged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "UPPERCASE")]
+pub enum ByteOrder {
+    /// As the protocol has it.
+    Ab,
+    /// Bytes exchanged.
+    Ba,
+    /// High word first.
+    Abcd,
+    /// Low word first.
+    Cdab,
+    /// High word first, bytes exchanged.
+    Badc,
+    /// Low word first, bytes exchanged.
+    Dcba,
+}
+
+impl ByteOrder {
+    /// As in the stack file.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Ab => "AB",
+            Self::Ba => "BA",
+            Self::Abcd => "ABCD",
+            Self::Cdab => "CDAB",
+            Self::Badc => "BADC",
+            Self::Dcba => "DCBA",
+        }
+    }
+
+    /// Whether the high word comes first, if the value has more than one; whether the bytes of a word are exchanged.
+    pub fn parts(self) -> (Option<WordOrder>, bool) {
+        match self {
+            Self::Ab => (None, false),
+            Self::Ba => (None, true),
+            Self::Abcd => (Some(WordOrder::HighFirst), false),
+            Self::Cdab => (Some(WordOrder::LowFirst), false),
+            Self::Badc => (Some(WordOrder::HighFirst), true),
+            Self::Dcba => (Some(WordOrder::LowFirst), true),
+        }
+    }
+}
+
 /// One `[[service.map]]` table.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -55,9 +101,22 @@ pub struct MapEntry {
     /// Exchanges the two bytes of every register.
     #[serde(default)]
     pub swap_bytes: bool,
+    /// Both of it in one word, in place of `word_order` and `swap_bytes`.
+    #[serde(default)]
+    pub order: Option<ByteOrder>,
     /// The server owns this part of %I: clients write it, the program reads it.
     #[serde(default)]
     pub own: bool,
+    /// Clients may not write it.
+    #[serde(default)]
+    pub read_only: bool,
+}
+
+impl MapEntry {
+    /// Word order and exchange of bytes, however they are written.
+    fn parts(&self) -> (Option<WordOrder>, bool) {
+        self.order.map_or((self.word_order, self.swap_bytes), ByteOrder::parts)
+    }
 }
 
 /// The key `map`: the name of a ready map, or tables.
@@ -134,8 +193,16 @@ pub enum MapError {
     WordOrder { entry: usize, got: String },
     #[error("map table {entry}: count {count} splits a value; %xD needs a multiple of 2, %xL of 4")]
     SplitsValue { entry: usize, count: u32 },
-    #[error("map table {entry}: swap_bytes is for registers, {table} shows single bits")]
+    #[error("map table {entry}: order and swap_bytes are for registers, {table} shows single bits")]
     SwapBits { entry: usize, table: &'static str },
+    #[error("map table {entry}: order says what word_order and swap_bytes say; keep one of them")]
+    OrderTwice { entry: usize },
+    #[error(
+        "map table {entry}: order {order} is for values of {bits} bits, but {got} has others; write AB or BA for %xW, ABCD, CDAB, BADC or DCBA for %xD and %xL"
+    )]
+    Order { entry: usize, order: &'static str, bits: &'static str, got: String },
+    #[error("map table {entry}: own = true lets clients write what read_only = true forbids; keep one of them")]
+    OwnReadOnly { entry: usize },
     #[error(
         "map table {entry}: own = true is for %I in coils or holding_registers, which clients can write; got {got} in {table}"
     )]
@@ -165,7 +232,8 @@ pub(crate) fn preset(preset: Preset, sizes: AreaSizes, addressing: Addressing) -
         let group = (size.bytes() / 2).max(1);
         let count = most.min(addressing.room(size, sizes.of(area)) * 8 / entry_bits) / group * group;
         let base = addressing.base(size);
-        Range { at, count, area, base, group, high_first: group > 1, swap_bytes: false, own: false }
+        let high_first = group > 1;
+        Range { at, count, area, base, group, high_first, swap_bytes: false, own: false, read_only: false }
     };
     let coils = range(0, TABLE_ENTRIES, Area::Output, AddressSize::Bit);
     let discrete = range(0, TABLE_ENTRIES, Area::Input, AddressSize::Bit);
@@ -252,14 +320,27 @@ fn entry_range(
         _ => {}
     }
     let group = if bits { 1 } else { (address.size.bytes() / 2).max(1) };
-    if config.word_order.is_some() && group == 1 {
+    if bits && (config.swap_bytes || config.order.is_some()) {
+        return Err(MapError::SwapBits { entry, table });
+    }
+    if let Some(order) = config.order {
+        if config.word_order.is_some() || config.swap_bytes {
+            return Err(MapError::OrderTwice { entry });
+        }
+        if order.parts().0.is_some() != (group > 1) {
+            let bits = if group > 1 { "16" } else { "32 or 64" };
+            return Err(MapError::Order { entry, order: order.name(), bits, got: got() });
+        }
+    }
+    let (word_order, swap_bytes) = config.parts();
+    if word_order.is_some() && group == 1 {
         return Err(MapError::WordOrder { entry, got: got() });
+    }
+    if config.own && config.read_only {
+        return Err(MapError::OwnReadOnly { entry });
     }
     if !config.count.is_multiple_of(group) {
         return Err(MapError::SplitsValue { entry, count: config.count });
-    }
-    if bits && config.swap_bytes {
-        return Err(MapError::SwapBits { entry, table });
     }
     let bit = address.bit.unwrap_or(0);
     let first_bit = u64::from(address.byte) * 8 + u64::from(bit);
@@ -285,9 +366,10 @@ fn entry_range(
         area: area_at,
         base: if bits { first_bit as u32 } else { address.byte },
         group,
-        high_first: config.word_order == Some(WordOrder::HighFirst),
-        swap_bytes: config.swap_bytes,
+        high_first: word_order == Some(WordOrder::HighFirst),
+        swap_bytes,
         own: config.own,
+        read_only: config.read_only,
     })
 }
 
@@ -337,6 +419,9 @@ impl MapError {
             | Self::WordOrder { entry, .. }
             | Self::SplitsValue { entry, .. }
             | Self::SwapBits { entry, .. }
+            | Self::OrderTwice { entry }
+            | Self::Order { entry, .. }
+            | Self::OwnReadOnly { entry }
             | Self::Own { entry, .. }
             | Self::OwnBits { entry } => Some(*entry),
             Self::Overlap { second, .. } => Some(*second),
@@ -370,8 +455,7 @@ impl RegisterMap {
                         WordOrder::LowFirst
                     }),
                     swap_bytes: range.swap_bytes,
-                    writable: matches!(table, Table::Coils | Table::HoldingRegisters)
-                        && (range.own || range.area != Area::Input),
+                    writable: matches!(table, Table::Coils | Table::HoldingRegisters) && range.writable(),
                     own: range.own,
                 });
             }

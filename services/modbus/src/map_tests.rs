@@ -5,7 +5,17 @@ use proptest::prelude::*;
 const SIZES: AreaSizes = AreaSizes { input: 64, output: 64, marker: 64 };
 
 fn entry(table: Table, at: u32, count: u32, area: &str) -> MapEntry {
-    MapEntry { table, at, count, area: area.to_owned(), word_order: None, swap_bytes: false, own: false }
+    MapEntry {
+        table,
+        at,
+        count,
+        area: area.to_owned(),
+        word_order: None,
+        swap_bytes: false,
+        order: None,
+        own: false,
+        read_only: false,
+    }
 }
 
 fn map(entries: &[MapEntry]) -> RegisterMap {

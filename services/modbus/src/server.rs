@@ -3,10 +3,13 @@
 //! [`answer`] carries out the state diagrams of V1.1b3 clause 6 for every transport. It knows no clock, no
 //! socket and no rail; what the registers are is the business of an [`Image`]. It allocates nothing.
 
+use crate::identity::Identity;
+use crate::line_state::{Diagnosed, LineState};
+use crate::protocol::files::{self, MAX_FIFO, MAX_RECORD, REFERENCE_TYPE};
 use crate::protocol::pdu::{
     EncodeError, Exception, MAX_PDU, Request, bytes_for_bits, decode_request, encode_exception, function,
 };
-use crate::protocol::{Response, encode_response};
+use crate::protocol::{MAX_EVENTS, Response, encode_response};
 
 /// One of the four primary tables (V1.1b3 clause 4.3).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, serde::Serialize, serde::Deserialize)]
@@ -103,12 +106,58 @@ pub trait Image {
     /// Carries out or queues a write, whole. A read that follows must see it.
     /// Err: [`Exception::ServerDeviceBusy`] when a queue is full.
     fn write(&mut self, write: &Write<'_>) -> Result<(), Exception>;
+
+    /// Which register map the requests from now on mean, for servers whose units have maps of their own.
+    fn select(&mut self, _map: usize) {}
+
+    /// The eight bits of function 7, where the device has them.
+    fn exception_status(&mut self) -> Result<u8, Exception> {
+        Ok(0)
+    }
+
+    /// Whether the device runs: the indicator of function 17.
+    fn is_running(&self) -> bool {
+        self.ready(Access::Read).is_ok()
+    }
+
+    /// Whether these records exist and may be accessed so. Err: [`Exception::IllegalDataAddress`].
+    fn check_file(&self, _access: Access, _file: u16, _record: u16, _count: u16) -> Result<(), Exception> {
+        Err(Exception::IllegalDataAddress)
+    }
+
+    /// Puts records into `out`, two bytes each, high byte first.
+    fn read_file(&mut self, _file: u16, _record: u16, _out: &mut [u8]) -> Result<(), Exception> {
+        Err(Exception::IllegalDataAddress)
+    }
+
+    /// Carries out or queues a write of file records, all groups of it or none; see [`files::write_groups`].
+    fn write_files(&mut self, _groups: &[u8]) -> Result<(), Exception> {
+        Err(Exception::IllegalDataAddress)
+    }
+
+    /// Whether there is a FIFO queue at this address. Err: [`Exception::IllegalDataAddress`].
+    fn check_fifo(&self, _address: u16) -> Result<(), Exception> {
+        Err(Exception::IllegalDataAddress)
+    }
+
+    /// Puts the registers of a FIFO queue into `out`, high byte first, without taking them out, and returns how
+    /// many. Err: [`Exception::IllegalDataValue`] when it says it holds more than 31 (V1.1b3 clause 6.18).
+    fn read_fifo(&mut self, _address: u16, _out: &mut [u8; 2 * MAX_FIFO]) -> Result<usize, Exception> {
+        Err(Exception::IllegalDataAddress)
+    }
+}
+
+/// What [`answer`] needs besides the image.
+pub struct Unit<'a> {
+    /// Counters, log and mode of the unit on its transport.
+    pub line: &'a mut LineState,
+    pub identity: &'a Identity,
 }
 
 /// What became of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Outcome {
-    /// Length of the response PDU, at least 2.
+    /// Length of the response PDU, at least 2; 0 for no response (listen-only mode was entered or left).
     pub len: usize,
     /// Function code of the request.
     pub function: u8,
@@ -122,10 +171,16 @@ pub struct Outcome {
 ///
 /// Order of checks as in V1.1b3 figure 9 and the diagrams of clause 6: function code (01), quantity, byte count
 /// and value (03), address (02), execution (04 or what the image says). Function 23 writes before it reads
-/// (clause 6.17), and only after both of its ranges were found.
-pub fn answer(request: &[u8], image: &mut dyn Image, out: &mut [u8; MAX_PDU]) -> Outcome {
+/// (clause 6.17), and only after both of its ranges were found. The CANopen general reference (43/13) needs a
+/// CANopen network and is refused with exception 01.
+pub fn answer(
+    request: &[u8],
+    unit: &mut Unit<'_>,
+    image: &mut dyn Image,
+    out: &mut [u8; MAX_PDU],
+) -> Outcome {
     let refused = match decode_request(request) {
-        Ok(request) => match execute(&request, image, out) {
+        Ok(request) => match execute(&request, unit, image, out) {
             Ok(len) => {
                 return Outcome {
                     len,
@@ -149,17 +204,21 @@ pub fn refuse(function: u8, exception: Exception, out: &mut [u8; MAX_PDU]) -> Ou
 }
 
 fn writes(request: &Request<'_>) -> bool {
-    !matches!(
+    matches!(
         request,
-        Request::ReadCoils { .. }
-            | Request::ReadDiscreteInputs { .. }
-            | Request::ReadHoldingRegisters { .. }
-            | Request::ReadInputRegisters { .. }
+        Request::WriteSingleCoil { .. }
+            | Request::WriteSingleRegister { .. }
+            | Request::WriteMultipleCoils { .. }
+            | Request::WriteMultipleRegisters { .. }
+            | Request::MaskWriteRegister { .. }
+            | Request::ReadWriteMultipleRegisters { .. }
+            | Request::WriteFileRecord { .. }
     )
 }
 
 fn execute(
     request: &Request<'_>,
+    unit: &mut Unit<'_>,
     image: &mut dyn Image,
     out: &mut [u8; MAX_PDU],
 ) -> Result<usize, Exception> {
@@ -218,8 +277,102 @@ fn execute(
             let function = function::READ_WRITE_MULTIPLE_REGISTERS;
             return read_words(function, table, read_address, read_quantity, image, out);
         }
+        _ => return execute_special(request, unit, image, out),
     };
     encode_response(&response, out).map_err(too_long)
+}
+
+/// The functions beyond tables.
+fn execute_special(
+    request: &Request<'_>,
+    unit: &mut Unit<'_>,
+    image: &mut dyn Image,
+    out: &mut [u8; MAX_PDU],
+) -> Result<usize, Exception> {
+    let mut log = [0; MAX_EVENTS];
+    let word;
+    let response = match *request {
+        Request::ReadExceptionStatus => Response::ReadExceptionStatus(image.exception_status()?),
+        Request::Diagnostics { sub_function, data } => {
+            let first = data.first_chunk::<2>().map_or(0, |first| u16::from_be_bytes(*first));
+            match unit.line.diagnose(sub_function, first) {
+                Diagnosed::Echo => Response::Diagnostics { sub_function, data },
+                Diagnosed::Value(value) => {
+                    word = value.to_be_bytes();
+                    Response::Diagnostics { sub_function, data: &word }
+                }
+                Diagnosed::Silent => return Ok(0),
+            }
+        }
+        Request::GetCommEventCounter => {
+            Response::GetCommEventCounter { status: 0, events: unit.line.event_count() }
+        }
+        Request::GetCommEventLog => {
+            let len = unit.line.copy_log(&mut log);
+            Response::GetCommEventLog {
+                status: 0,
+                events: unit.line.event_count(),
+                messages: unit.line.message_count(),
+                log: &log[..len],
+            }
+        }
+        Request::ReportServerId => return Ok(unit.identity.report(image.is_running(), out)),
+        Request::ReadFileRecord { groups } => return read_files(groups, image, out),
+        Request::WriteFileRecord { groups } => {
+            for group in files::write_groups(groups) {
+                check_file(Access::Write, group.reference, group.file, group.record, group.count(), image)?;
+            }
+            image.ready(Access::Write)?;
+            image.write_files(groups)?;
+            Response::WriteFileRecord { groups }
+        }
+        Request::ReadFifoQueue { address } => {
+            image.check_fifo(address)?;
+            image.ready(Access::Read)?;
+            let mut values = [0; 2 * MAX_FIFO];
+            let count = image.read_fifo(address, &mut values)?;
+            let values = values.get(..count * 2).ok_or(Exception::IllegalDataValue)?;
+            return encode_response(&Response::ReadFifoQueue(values), out).map_err(too_long);
+        }
+        Request::ReadDeviceIdentification { code, object } => return unit.identity.read(code, object, out),
+        // 43/13 needs a CANopen network, and every other function was served before.
+        _ => return Err(Exception::IllegalFunction),
+    };
+    encode_response(&response, out).map_err(too_long)
+}
+
+fn check_file(
+    access: Access,
+    reference: u8,
+    file: u16,
+    record: u16,
+    count: u16,
+    image: &dyn Image,
+) -> Result<(), Exception> {
+    let last = u32::from(record) + u32::from(count) - 1;
+    if reference != REFERENCE_TYPE || file == 0 || last > u32::from(MAX_RECORD) {
+        return Err(Exception::IllegalDataAddress);
+    }
+    image.check_file(access, file, record, count)
+}
+
+fn read_files(groups: &[u8], image: &mut dyn Image, out: &mut [u8; MAX_PDU]) -> Result<usize, Exception> {
+    for group in files::read_groups(groups) {
+        check_file(Access::Read, group.reference, group.file, group.record, group.count, image)?;
+    }
+    image.ready(Access::Read)?;
+    let mut len = 2;
+    for group in files::read_groups(groups) {
+        let bytes = usize::from(group.count) * 2;
+        let slot = out.get_mut(len..len + 2 + bytes).ok_or(Exception::IllegalDataValue)?;
+        slot[0] = (1 + bytes) as u8;
+        slot[1] = REFERENCE_TYPE;
+        image.read_file(group.file, group.record, &mut slot[2..])?;
+        len += 2 + bytes;
+    }
+    out[0] = function::READ_FILE_RECORD;
+    out[1] = (len - 2) as u8;
+    Ok(len)
 }
 
 fn write(

@@ -1,11 +1,16 @@
 //! One TCP connection without the TCP: bytes in, bytes and a verdict out.
 //!
 //! A session owns a receive and a transmit buffer, both made once. It answers pipelined requests in their
-//! order, at most [`MAX_BATCH`] at a time, and gathers their answers so that one read costs one write.
+//! order, at most [`MAX_BATCH`] at a time, and gathers their answers so that one read costs one write. It speaks
+//! Modbus TCP, or RTU frames on the stream as a port server sends them.
 
+use crate::device::{Device, Served};
 use crate::protocol::mbap::{self, MAX_ADU, MAX_RECEIVED, Scan};
-use crate::protocol::pdu::{Exception, MAX_PDU};
-use crate::server::{Image, Outcome, answer, refuse};
+use crate::protocol::pdu::MAX_PDU;
+use crate::protocol::rtu;
+use crate::rights::Peer;
+use crate::server::{Image, Outcome};
+use crate::stream::{self, Found};
 
 /// Most requests answered before the answers are written and others get their turn.
 pub const MAX_BATCH: usize = 16;
@@ -13,51 +18,31 @@ const BUFFER: usize = MAX_BATCH * MAX_ADU;
 /// Highest exception code counted by itself (V1.1b3 clause 7).
 pub const MAX_EXCEPTION: usize = 0x0B;
 
-/// Which unit identifiers are served.
-///
-/// Units 0 and 255 address the device itself and are always served (Guide V1.0b clause 4.4.2.2: on TCP the
-/// unit is not used to address a device that is reached by its IP address). Others get exception 0A.
-#[derive(Clone, Debug, PartialEq, Eq, Default)]
-pub struct UnitRule {
-    only: Option<[u64; 4]>,
-}
-
-impl UnitRule {
-    /// Every unit is served.
-    pub fn any() -> Self {
-        Self { only: None }
-    }
-
-    /// These, 0 and 255 are served.
-    pub fn only(units: &[u8]) -> Self {
-        let mut set = [0_u64; 4];
-        for unit in units.iter().copied().chain([0, 255]) {
-            if let Some(word) = set.get_mut(usize::from(unit / 64)) {
-                *word |= 1 << (unit % 64);
-            }
-        }
-        Self { only: Some(set) }
-    }
-
-    /// Whether a unit is served.
-    pub fn serves(&self, unit: u8) -> bool {
-        self.only.is_none_or(|set| {
-            set.get(usize::from(unit / 64)).is_some_and(|word| word >> (unit % 64) & 1 == 1)
-        })
-    }
+/// How frames lie in the stream.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+pub enum Framing {
+    /// Modbus TCP.
+    #[default]
+    Tcp,
+    /// RTU frames one behind the other.
+    Rtu,
 }
 
 /// What a session has seen since it began.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
 pub struct SessionCounts {
-    /// Requests answered, exceptions included.
+    /// Requests taken, exceptions and those without an answer included.
     pub requests: u64,
     /// Requests answered by an exception.
     pub exceptions: u64,
     /// Of these, by exception code; index 0 is unused.
     pub by_exception: [u64; MAX_EXCEPTION + 1],
-    /// Frames of another protocol, dropped without an answer.
+    /// Frames of another protocol, and of other units on RTU over TCP, dropped without an answer.
     pub foreign: u64,
+    /// Requests carried out that have no answer: broadcasts, listen-only mode.
+    pub silent: u64,
+    /// RTU over TCP: bytes that belonged to no frame.
+    pub noise: u64,
     /// Unit of the last request.
     pub last_unit: u8,
     /// Function code of the last request.
@@ -77,6 +62,7 @@ pub enum Next {
 
 /// The state of one connection.
 pub struct Session {
+    framing: Framing,
     received: Box<[u8]>,
     start: usize,
     end: usize,
@@ -88,14 +74,15 @@ pub struct Session {
 
 impl Default for Session {
     fn default() -> Self {
-        Self::new()
+        Self::new(Framing::Tcp)
     }
 }
 
 impl Session {
     /// A fresh connection; makes its two buffers (8320 bytes).
-    pub fn new() -> Self {
+    pub fn new(framing: Framing) -> Self {
         Self {
+            framing,
             received: vec![0; BUFFER].into_boxed_slice(),
             start: 0,
             end: 0,
@@ -139,8 +126,15 @@ impl Session {
 
     /// Answers the requests received so far, at most [`MAX_BATCH`]. Call it only when the output of the last
     /// call was written.
-    pub fn process(&mut self, units: &UnitRule, image: &mut dyn Image) -> Next {
+    pub fn process(&mut self, device: &mut Device, peer: &Peer, image: &mut dyn Image) -> Next {
         (self.output_len, self.output_sent) = (0, 0);
+        match self.framing {
+            Framing::Tcp => self.process_tcp(device, peer, image),
+            Framing::Rtu => self.process_rtu(device, peer, image),
+        }
+    }
+
+    fn process_tcp(&mut self, device: &mut Device, peer: &Peer, image: &mut dyn Image) -> Next {
         let mut left = MAX_BATCH;
         loop {
             let (frame, used) = match mbap::scan(&self.received[self.start..self.end]) {
@@ -163,23 +157,80 @@ impl Session {
                 return Next::Again; // not reached: the buffer holds MAX_BATCH answers of any size
             };
             let Some(body) = body.first_chunk_mut::<MAX_PDU>() else { return Next::Again };
-            let outcome = if units.serves(frame.unit) {
-                answer(frame.pdu, image, body)
-            } else {
-                refuse(frame.pdu.first().copied().unwrap_or(0), Exception::GatewayPathUnavailable, body)
-            };
-            *head = mbap::header(frame.transaction, frame.unit, outcome.len);
-            self.output_len += mbap::HEADER + outcome.len;
-            self.start += used;
             let unit = frame.unit;
-            self.count(unit, &outcome);
+            let served = device.serve(unit, frame.pdu, peer, image, body);
+            if let Served::Answer(outcome) = served {
+                *head = mbap::header(frame.transaction, unit, outcome.len);
+                self.output_len += mbap::HEADER + outcome.len;
+            }
+            let function = frame.pdu.first().copied().unwrap_or(0);
+            self.start += used;
+            self.count(unit, function, served);
         }
     }
 
-    fn count(&mut self, unit: u8, outcome: &Outcome) {
+    fn process_rtu(&mut self, device: &mut Device, peer: &Peer, image: &mut dyn Image) -> Next {
+        let mut left = MAX_BATCH;
+        loop {
+            let bytes = &self.received[self.start..self.end];
+            let (skipped, len) = match stream::find(bytes, |unit| device.serves(unit)) {
+                Found::Nothing { skip } => {
+                    self.start += skip;
+                    self.counts.noise += skip as u64;
+                    return Next::Read;
+                }
+                Found::Frame { skip, len } => (skip, len),
+            };
+            if left == 0 {
+                return Next::Again;
+            }
+            left -= 1;
+            let Ok((unit, pdu)) = rtu::decode(bytes.get(skipped..skipped + len).unwrap_or_default()) else {
+                return Next::Read; // not reached: it was found by its CRC
+            };
+            let mut answer = [0; MAX_PDU];
+            let served = device.serve(unit, pdu, peer, image, &mut answer);
+            let function = pdu.first().copied().unwrap_or(0);
+            if let Served::Answer(outcome) = served
+                && let Some(out) = self.output[self.output_len..].first_chunk_mut()
+            {
+                self.output_len += rtu::encode(unit, &answer[..outcome.len], out);
+            }
+            self.start += skipped + len;
+            self.counts.noise += skipped as u64;
+            self.count(unit, function, served);
+        }
+    }
+
+    /// Whether a frame was begun and its end is missing. Only RTU on a stream needs to know: the end may never come.
+    pub fn is_waiting(&self) -> bool {
+        self.framing == Framing::Rtu && self.start < self.end
+    }
+
+    /// The stream was silent for so long that what was begun is no frame: drops its first byte, so that
+    /// [`Session::process`] looks behind it.
+    pub fn silence(&mut self) {
+        if self.is_waiting() {
+            self.start += 1;
+            self.counts.noise += 1;
+        }
+    }
+
+    fn count(&mut self, unit: u8, function: u8, served: Served) {
+        match served {
+            Served::NotOurs => {
+                self.counts.foreign += 1;
+                return;
+            }
+            Served::Silent(_) => self.counts.silent += 1,
+            Served::Answer(outcome) => self.count_answer(&outcome),
+        }
         self.counts.requests += 1;
         self.counts.last_unit = unit;
-        self.counts.last_function = outcome.function;
+        self.counts.last_function = function;
+    }
+
+    fn count_answer(&mut self, outcome: &Outcome) {
         if let Some(exception) = outcome.exception {
             self.counts.exceptions += 1;
             if let Some(count) = self.counts.by_exception.get_mut(usize::from(exception.code())) {

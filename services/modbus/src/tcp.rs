@@ -1,13 +1,16 @@
 //! Modbus TCP connections on a current-thread tokio runtime.
 //!
-//! A [`Hub`] holds what all connections share: the image, the rules of admission, the list of clients, the
-//! counters. Every connection is one local task that reads, lets its [`Session`] answer, and writes once. No
+//! A [`Hub`] holds what all connections of a listener share: the image, the device, the rules of admission, the list
+//! of clients, the counters. Every connection is one local task that reads, lets its [`Session`] answer, and writes once. No
 //! task holds the image across an await, so one request is always served from one state of it.
 
+use crate::admission::Admission;
+use crate::device::Device;
+use crate::rights::Peer;
 use crate::server::Image;
-use crate::session::{MAX_EXCEPTION, Next, Session, SessionCounts, UnitRule};
+use crate::session::{Framing, MAX_EXCEPTION, Next, Session, SessionCounts};
 use ipc_types::clock;
-use ipc_types::net::{IpFilter, Seldom};
+use ipc_types::net::Seldom;
 use serde::{Deserialize, Serialize};
 use std::cell::{Cell, RefCell};
 use std::fmt;
@@ -23,6 +26,9 @@ use tokio::sync::Notify;
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Pause after an accept that failed for want of descriptors or memory.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+/// RTU over TCP: a frame that was begun and does not go on for so long is noise. Longer than a lost segment takes to
+/// come again.
+const FRAME_TIMEOUT: Duration = Duration::from_millis(500);
 /// Happenings kept between two calls of [`Hub::take_happenings`]; a flood of connections must not flood the rail.
 const MAX_HAPPENINGS: usize = 8;
 
@@ -48,8 +54,8 @@ pub enum WhenFull {
 #[derive(Clone, Debug)]
 pub struct Options {
     pub max_connections: usize,
-    pub filter: Option<IpFilter>,
-    pub units: UnitRule,
+    pub filter: Admission,
+    pub framing: Framing,
     /// A connection without a request for this long is closed; `None` = never.
     pub idle_timeout: Option<Duration>,
     pub when_full: WhenFull,
@@ -61,8 +67,8 @@ impl Default for Options {
     fn default() -> Self {
         Self {
             max_connections: 8,
-            filter: None,
-            units: UnitRule::any(),
+            filter: Admission::default(),
+            framing: Framing::Tcp,
             idle_timeout: Some(Duration::from_mins(1)),
             when_full: WhenFull::Refuse,
             min_idle: Duration::from_secs(1),
@@ -106,8 +112,12 @@ pub struct Counters {
     pub exceptions: u64,
     /// By exception code, index 0 unused.
     pub by_exception: [u64; MAX_EXCEPTION + 1],
-    /// Frames of another protocol, dropped without an answer.
+    /// Frames of another protocol, and of other units on RTU over TCP, dropped without an answer.
     pub foreign: u64,
+    /// Requests without an answer: broadcasts on RTU over TCP, listen-only mode.
+    pub silent: u64,
+    /// RTU over TCP: bytes that belonged to no frame.
+    pub noise: u64,
     pub closed_peer: u64,
     pub closed_error: u64,
     pub closed_bad_length: u64,
@@ -134,6 +144,8 @@ impl Counters {
         self.requests += after.requests - before.requests;
         self.exceptions += after.exceptions - before.exceptions;
         self.foreign += after.foreign - before.foreign;
+        self.silent += after.silent - before.silent;
+        self.noise += after.noise - before.noise;
         for ((sum, old), new) in self.by_exception.iter_mut().zip(before.by_exception).zip(after.by_exception)
         {
             *sum += new - old;
@@ -180,10 +192,10 @@ impl fmt::Display for Happening {
         match self {
             Self::Connected { peer } => write!(f, "Modbus client {peer} connected"),
             Self::Refused { peer, why: Refusal::Filter } => {
-                write!(f, "Modbus client {peer} refused: its address is outside tcp.filter")
+                write!(f, "Modbus client {peer} refused: the filter does not admit its address")
             }
             Self::Refused { peer, why: Refusal::Full } => {
-                write!(f, "Modbus client {peer} refused: tcp.max_connections are in use")
+                write!(f, "Modbus client {peer} refused: max_connections are in use")
             }
             Self::Refused { peer, why: Refusal::Disabled } => {
                 write!(f, "Modbus client {peer} refused: the server is switched off")
@@ -193,7 +205,7 @@ impl fmt::Display for Happening {
                     CloseReason::Peer => "it closed the connection",
                     CloseReason::Error => "the connection broke",
                     CloseReason::BadLength => "it sent a header with an impossible length",
-                    CloseReason::Idle => "it was idle for tcp.idle_timeout",
+                    CloseReason::Idle => "it was idle for idle_timeout",
                     CloseReason::Replaced => "it was idle and made room for another client",
                     CloseReason::NotReading => "it did not take its answers",
                     CloseReason::Disabled => "the server was switched off",
@@ -224,7 +236,8 @@ impl Client {
 
 /// What all connections of a server share.
 pub struct Hub<B> {
-    backend: RefCell<B>,
+    backend: Rc<RefCell<B>>,
+    device: RefCell<Device>,
     options: Options,
     enabled: Cell<bool>,
     clients: RefCell<Vec<Rc<Client>>>,
@@ -234,10 +247,11 @@ pub struct Hub<B> {
 }
 
 impl<B: Backend + 'static> Hub<B> {
-    /// A hub without connections, enabled.
-    pub fn new(backend: B, options: Options) -> Rc<Self> {
+    /// A hub without connections, enabled. Several may share an image.
+    pub fn new(backend: Rc<RefCell<B>>, device: Device, options: Options) -> Rc<Self> {
         Rc::new(Self {
-            backend: RefCell::new(backend),
+            backend,
+            device: RefCell::new(device),
             options,
             enabled: Cell::new(true),
             clients: RefCell::new(Vec::new()),
@@ -284,6 +298,11 @@ impl<B: Backend + 'static> Hub<B> {
         } else {
             self.happenings_left_out.set(self.happenings_left_out.get() + 1);
         }
+    }
+
+    /// Addresses of the clients connected now, oldest first.
+    pub fn for_each_peer(&self, mut each: impl FnMut(SocketAddr)) {
+        self.clients.borrow().iter().for_each(|client| each(client.peer));
     }
 
     /// The clients connected now, oldest first.
@@ -359,7 +378,7 @@ impl<B: Backend + 'static> Hub<B> {
             self.update(|counters| counters.refused_disabled += 1);
             return self.happened(Happening::Refused { peer, why: Refusal::Disabled });
         }
-        if self.options.filter.is_some_and(|filter| !filter.allows(peer.ip())) {
+        if !self.options.filter.allows(peer.ip()) {
             self.update(|counters| counters.refused_filter += 1);
             return self.happened(Happening::Refused { peer, why: Refusal::Filter });
         }
@@ -411,18 +430,23 @@ impl<B: Backend + 'static> Hub<B> {
     }
 
     async fn serve(&self, mut stream: TcpStream, client: &Client) -> CloseReason {
-        let mut session = Session::new();
+        let mut session = Session::new(self.options.framing);
         loop {
+            let waiting = session.is_waiting();
             let read = tokio::select! {
                 biased;
                 () = client.wake.notified() => return client.closing.get().unwrap_or(CloseReason::Disabled),
-                read = stream.read(session.space()) => read,
+                read = stream.read(session.space()) => Some(read),
+                () = tokio::time::sleep(FRAME_TIMEOUT), if waiting => None,
             };
             match read {
+                None => session.silence(),
+                Some(read) => match read {
                 Ok(0) => return CloseReason::Peer,
                 Ok(n) => session.received(n),
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
                 Err(_) => return CloseReason::Error,
+                },
             }
             loop {
                 let next = self.process(&mut session, client);
@@ -449,7 +473,7 @@ impl<B: Backend + 'static> Hub<B> {
         let next = {
             let mut backend = self.backend.borrow_mut();
             backend.begin();
-            session.process(&self.options.units, &mut *backend)
+            session.process(&mut self.device.borrow_mut(), &Peer::Ip(client.peer.ip()), &mut *backend)
         };
         let after = session.counts();
         if after.requests != before.requests {

@@ -47,8 +47,8 @@ pub struct Config {
     pub flush_interval: Span,
     #[serde(default)]
     pub compression: Compression,
-    /// Indexes for readers that jump to a time or topic (Foxglove, PlotJuggler): 16 bytes a message. Without,
-    /// they read the file from the start.
+    /// Indexes for readers that jump to a time or topic (Foxglove, PlotJuggler): 16 bytes a message, which is a third
+    /// of a quiet stack's recording. Without, every reader goes through the file from its start.
     #[serde(default = "default_index")]
     pub index: bool,
     /// Topics that are not recorded; a trailing `*` stands for any ending.
@@ -73,7 +73,7 @@ fn default_flush_interval() -> Span {
 }
 
 fn default_index() -> bool {
-    true
+    false
 }
 
 impl Default for Config {
@@ -252,7 +252,7 @@ mod tests {
         let text = serde_json::to_string(&Config::default()).unwrap();
         assert_eq!(
             text,
-            r#"{"dir":"recordings","max_size":"100MiB","max_time":null,"keep":"2GiB","min_free":"64MiB","flush_interval":"50ms","compression":"zstd","index":true,"exclude":[]}"#
+            r#"{"dir":"recordings","max_size":"100MiB","max_time":null,"keep":"2GiB","min_free":"64MiB","flush_interval":"50ms","compression":"zstd","index":false,"exclude":[]}"#
         );
     }
 

@@ -6,6 +6,7 @@
 
 use crate::config::matches;
 use crate::file::ChannelSpec;
+use ipc_types::event::{EventBody, EventKind};
 use ipc_types::payload::Encoding;
 use ipc_types::stack::{Stack, TopicEntry};
 use serde::{Deserialize, Serialize};
@@ -230,6 +231,53 @@ impl AttachedFile {
     }
 }
 
+/// Modules of each plc that are looked at: the running one, and the one that a load has just replaced.
+const MODULES_EACH: usize = 2;
+
+/// The compiled programs that the stack's plcs left in its root, `<svc>.<hash>.wasm`, the newest of each plc last.
+/// So a recording verifies alone, wherever a program was loaded from and whatever became of its source.
+pub fn modules(stack: &Stack) -> Vec<(String, PathBuf)> {
+    let mut found: Vec<(String, SystemTime, String)> = Vec::new();
+    for entry in std::fs::read_dir(&stack.root).into_iter().flatten().flatten() {
+        let Ok(name) = entry.file_name().into_string() else { continue };
+        let Some(service) = module_of(&name) else { continue };
+        let is_plc = stack.service(service).is_some_and(|s| s.kind == "plc");
+        // No link, whatever it leads to: only what a plc wrote itself.
+        let Some(meta) = entry.metadata().ok().filter(|m| m.is_file() && is_plc) else { continue };
+        let written = meta.modified().unwrap_or(SystemTime::UNIX_EPOCH);
+        found.push((service.to_owned(), written, name.clone()));
+    }
+    found.sort();
+    let newer = |i: usize| found[i + 1..].iter().filter(|(service, ..)| *service == found[i].0).count();
+    (0..found.len())
+        .filter(|i| newer(*i) < MODULES_EACH)
+        .map(|i| (found[i].2.clone(), stack.root.join(&found[i].2)))
+        .collect()
+}
+
+/// The content of a file that is to be attached, or why it cannot be.
+pub fn read_attachment(path: &Path) -> Result<Vec<u8>, String> {
+    let why = |cause: String| format!("{} is not in the recording: {cause}", path.display());
+    let bytes = std::fs::metadata(path).map_err(|e| why(e.to_string()))?.len();
+    if bytes > MAX_ATTACHMENT {
+        return Err(why(format!("larger than {MAX_ATTACHMENT} bytes")));
+    }
+    std::fs::read(path).map_err(|e| why(e.to_string()))
+}
+
+/// The service of a module's file name.
+fn module_of(name: &str) -> Option<&str> {
+    let (service, hash) = name.strip_suffix(".wasm")?.rsplit_once('.')?;
+    (hash.len() == 16 && hash.bytes().all(|b| b.is_ascii_hexdigit())).then_some(service)
+}
+
+/// Whether an event says that a program was loaded.
+pub fn says_loaded(event: &[u8]) -> bool {
+    let word = b"\"loaded\"";
+    event.windows(word.len()).any(|w| w == word)
+        && serde_json::from_slice::<EventBody>(event).is_ok_and(|body| body.event == EventKind::Loaded)
+}
+
 /// Media type by the ending of a name.
 pub fn media_type(name: &str) -> &'static str {
     match Path::new(name).extension().and_then(|e| e.to_str()) {
@@ -293,6 +341,45 @@ mod tests {
         assert_eq!(files[0].read_if_changed(), Some(Ok(b"BC".to_vec())));
         assert!(matches!(files[1].read_if_changed(), Some(Err(text)) if text.contains("gone.eds is not in")));
         assert_eq!(files[1].read_if_changed(), None);
+    }
+
+    #[test]
+    fn the_newest_modules_of_each_plc_are_found() {
+        let dir = TempDir::new("modules");
+        let mut stack = stack_of("modules", dir.path(), &[]);
+        stack.root = dir.path().to_owned();
+        for (name, kind) in [("plc", "plc"), ("plc2", "plc"), ("io", "can-io")] {
+            stack.services.push(crate::testing::entry(name, kind, 1));
+        }
+        assert!(modules(&stack).is_empty());
+        let write = |name: &str, age_s: u64| {
+            let file = std::fs::File::create(dir.path().join(name)).unwrap();
+            file.set_modified(SystemTime::UNIX_EPOCH + std::time::Duration::from_secs(1000 - age_s)).unwrap();
+        };
+        write("plc.00000000000000aa.wasm", 30);
+        write("plc.00000000000000bb.wasm", 10);
+        write("plc.00000000000000cc.wasm", 20);
+        write("plc2.00000000000000dd.wasm", 99);
+        for no in ["io.00000000000000aa.wasm", "gone.00000000000000aa.wasm", "plc.12.wasm", "plc.wasm", "stack.json"] {
+            write(no, 0);
+        }
+        std::os::unix::fs::symlink("/etc/passwd", dir.path().join("plc.00000000000000ee.wasm")).unwrap();
+        let names: Vec<_> = modules(&stack).into_iter().map(|(name, _)| name).collect();
+        assert_eq!(
+            names,
+            ["plc.00000000000000cc.wasm", "plc.00000000000000bb.wasm", "plc2.00000000000000dd.wasm"]
+        );
+    }
+
+    #[test]
+    fn only_a_loaded_event_says_loaded() {
+        let event = |kind| {
+            let body = EventBody::now(kind, ipc_types::event::Level::Info, "plc", "\"loaded\"", serde_json::Value::Null);
+            serde_json::to_vec(&body).unwrap()
+        };
+        assert!(says_loaded(&event(EventKind::Loaded)));
+        assert!(!says_loaded(&event(EventKind::Died)));
+        assert!(!says_loaded(br#"{"event":"loaded"}"#) && !says_loaded(b""));
     }
 
     #[test]

@@ -11,6 +11,8 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+/// Messages that came within less time than this have no rate worth telling.
+pub const RATE_SPAN_S: f64 = 0.1;
 /// Clock jumps that are listed.
 const MAX_JUMPS: usize = 64;
 
@@ -24,8 +26,9 @@ pub struct ChannelInfo {
     pub messages: u64,
     /// Payload bytes.
     pub bytes: u64,
-    /// Messages per second between the first and the last.
-    pub rate: f64,
+    /// Messages per second between the first and the last; `None` when these are less than [`RATE_SPAN_S`] apart,
+    /// as the parts of a single keyframe are.
+    pub rate: Option<f64>,
     /// UTC in ns; 0 without messages.
     pub first_ns: u64,
     pub last_ns: u64,
@@ -157,7 +160,7 @@ fn sum_up(info: &mut Info, recording: &Recording, counts: &BTreeMap<u16, Count>)
     for channel in recording.channels() {
         let count = counts.get(&channel.id).unwrap_or(&none);
         let span = seconds(count.first_ns, count.last_ns);
-        let rate = if span > 0.0 { count.messages.saturating_sub(1) as f64 / span } else { 0.0 };
+        let rate = (span >= RATE_SPAN_S).then(|| count.messages.saturating_sub(1) as f64 / span);
         let numbered = channel.kind.is_some() && channel.message_encoding == "ros1";
         let missed = info.gaps.as_ref().and_then(|g| g.topics.get(&channel.topic)).map_or(0, |g| g.missed());
         info.channels.push(ChannelInfo {
@@ -235,10 +238,11 @@ impl fmt::Display for Info {
         )?;
         for c in &self.channels {
             let gaps = c.gaps.map_or("-".to_owned(), |g| g.to_string());
+            let rate = c.rate.map_or("-".to_owned(), |r| format!("{r:.1}"));
             writeln!(
                 f,
-                "  {:width$} {:>10} {:>12} {:>10.1} {:>8} {:>8}  {}",
-                c.topic, c.messages, c.bytes, c.rate, gaps, c.missed, c.schema
+                "  {:width$} {:>10} {:>12} {:>10} {:>8} {:>8}  {}",
+                c.topic, c.messages, c.bytes, rate, gaps, c.missed, c.schema
             )?;
         }
         Ok(())

@@ -20,6 +20,7 @@ use ipc_types::topic::TopicKind;
 use mcap::records::MessageHeader;
 use mcap::{McapError, McapResult};
 use serde::Serialize;
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -133,6 +134,10 @@ pub struct Writer {
     dir: PathBuf,
     topics: Vec<Topic>,
     attached: Vec<AttachedFile>,
+    /// Compiled programs that stand in the current file.
+    modules: BTreeSet<String>,
+    /// A plc has loaded a program: it may be one that the current file lacks.
+    loaded: bool,
     shared: Arc<Shared>,
     notices: Sender<Notice>,
     sync: Option<Syncer>,
@@ -177,6 +182,8 @@ impl Writer {
             .collect();
         Self {
             attached: format::attached_files(&stack),
+            modules: BTreeSet::new(),
+            loaded: false,
             config,
             stack,
             service: service.to_owned(),
@@ -249,10 +256,20 @@ impl Writer {
                 self.fail(&error);
             }
         }
-        if let Err(error) = self.flush(now) {
+        if let Err(error) = self.attach_loaded().and_then(|()| self.flush(now)) {
             self.fail(&error);
         }
         self.show();
+    }
+
+    /// The program that was just loaded goes into the file, before its file may be gone.
+    fn attach_loaded(&mut self) -> McapResult<()> {
+        match &mut self.open {
+            Some(open) if std::mem::take(&mut self.loaded) => {
+                attach_modules(&mut open.mcap, &self.stack, &mut self.modules, &self.notices)
+            }
+            _ => Ok(()),
+        }
     }
 
     fn message(&mut self, batch: &Batch, entry: &Entry, now: Instant) -> McapResult<()> {
@@ -272,6 +289,7 @@ impl Writer {
         let data = if topic.json { batch.message(entry).1 } else { batch.data(entry) };
         open.mcap.message(&head, data, now)?;
         topic.recorded += 1;
+        self.loaded |= topic.kind == TopicKind::Events && format::says_loaded(data);
         if topic.kind == TopicKind::Keyframe && !topic.keyframe {
             topic.keyframe = true;
             let missing = self.topics.iter().any(|t| t.kind == TopicKind::Keyframe && !t.keyframe);
@@ -482,6 +500,8 @@ impl Writer {
         mcap.attach(RESOLVED_STACK, "application/json", utc, &resolved)?;
         self.attached.iter_mut().for_each(AttachedFile::forget);
         attach_changed(&mut mcap, &mut self.attached, &self.notices)?;
+        self.modules.clear();
+        attach_modules(&mut mcap, &self.stack, &mut self.modules, &self.notices)?;
         for topic in &mut self.topics {
             topic.channel = mcap.add_channel(&topic.spec)?;
         }
@@ -579,6 +599,28 @@ fn attach_changed(
                 let _ = notices.send(Notice { fault: true, message, detail });
             }
             None => {}
+        }
+    }
+    Ok(())
+}
+
+/// Adds the compiled programs that the file lacks. One that cannot be read is told, once a file.
+fn attach_modules(
+    mcap: &mut RecordingFile,
+    stack: &Stack,
+    there: &mut BTreeSet<String>,
+    notices: &Sender<Notice>,
+) -> McapResult<()> {
+    let utc = clock::utc_ns().max(0) as u64;
+    for (name, path) in format::modules(stack) {
+        if !there.insert(name.clone()) {
+            continue;
+        }
+        match format::read_attachment(&path) {
+            Ok(data) => mcap.attach(&name, format::media_type(&name), utc, &data)?,
+            Err(message) => {
+                let _ = notices.send(Notice { fault: true, message, detail: serde_json::Value::Null });
+            }
         }
     }
     Ok(())

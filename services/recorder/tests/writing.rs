@@ -296,3 +296,36 @@ fn a_clock_that_jumps_is_in_the_file() {
     assert_eq!(frames[1].log_time - frames[0].log_time, 3_600_000_000_000);
     assert_eq!(frames[1].stamp.t_ns, frames[0].stamp.t_ns);
 }
+
+#[test]
+fn a_program_loaded_while_recording_stands_in_this_file_and_the_next() {
+    let dir = TempDir::new("loaded");
+    let stack = stack(dir.path());
+    std::fs::create_dir_all(&stack.root).unwrap();
+    let module = |hash: &str| stack.root.join(format!("plc.{hash}.wasm"));
+    std::fs::write(module("00000000000000aa"), b"\0asm first").unwrap();
+    let loaded = |seq: u64| {
+        let body = serde_json::json!({ "event": "loaded", "level": "info", "service": "plc", "message": "program loaded",
+                                       "utc_ns": 1, "t_ns": 1 });
+        message(EVENTS, ipc_types::payload::Event::default(), body.to_string().as_bytes(), seq, clock::mono_ns())
+    };
+    let names = |file: &std::path::Path| {
+        let found = dinrail_recorder::scan::attachments(file).unwrap();
+        found.into_iter().filter(|a| a.name.ends_with(".wasm")).map(|a| (a.name, a.data)).collect::<Vec<_>>()
+    };
+    let mut rig = Rig::start(stack.clone(), Config::default());
+    rig.send(&[frame(1, clock::mono_ns())]);
+    std::fs::write(module("00000000000000bb"), b"\0asm second").unwrap();
+    // Written, but not loaded: not in the file.
+    rig.send(&[frame(2, clock::mono_ns())]);
+    rig.settle();
+    assert_eq!(names(&rig.files()[0]), [("plc.00000000000000aa.wasm".to_owned(), b"\0asm first".to_vec())]);
+    rig.send(&[loaded(1), frame(3, clock::mono_ns())]);
+    rig.send(&[loaded(2)]);
+    let files = rig.stop();
+    let both = ["plc.00000000000000aa.wasm", "plc.00000000000000bb.wasm"];
+    assert_eq!(names(&files[0]).into_iter().map(|(name, _)| name).collect::<Vec<_>>(), both, "each once");
+    // A recorder that starts later finds it without the event.
+    let files = Rig::start(stack, Config::default()).stop();
+    assert_eq!(names(files.last().unwrap()).into_iter().map(|(name, _)| name).collect::<Vec<_>>(), both);
+}

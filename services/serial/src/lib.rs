@@ -1,1 +1,3 @@
 //! The serial port driver: one process a port.
+
+pub mod protocol;

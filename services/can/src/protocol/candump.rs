@@ -59,6 +59,8 @@ pub struct LogLine<'a> {
     pub bus: &'a str,
     /// The frame.
     pub frame: Frame,
+    /// Marked `T`: sent by the one who logged.
+    pub tx: bool,
 }
 
 /// Reads `123#DEADBEEF` and its relatives; dots between data bytes are allowed as in cansend.
@@ -151,7 +153,7 @@ pub fn format(frame: &Frame) -> String {
 }
 
 /// Reads one line of a candump log. Empty lines and lines that begin with `#` are `None`; a trailing `R` or `T`
-/// (direction, `candump -x` and python-can) is ignored, as are stamp digits beyond nanoseconds.
+/// is the direction (`candump -x`, python-can). Stamp digits beyond nanoseconds are left out.
 pub fn parse_log_line(line: &str) -> Result<Option<LogLine<'_>>, ParseError> {
     if line.len() > MAX_LINE {
         return Err(ParseError::TooLong(line.len()));
@@ -163,27 +165,19 @@ pub fn parse_log_line(line: &str) -> Result<Option<LogLine<'_>>, ParseError> {
     }
     let t_ns = parse_stamp(stamp)?;
     let (Some(bus), Some(text)) = (words.next(), words.next()) else { return Err(ParseError::Columns) };
-    match (words.next(), words.next()) {
-        (None | Some("R" | "T" | "r" | "t"), None) => {}
+    let tx = match (words.next(), words.next()) {
+        (None | Some("R" | "r"), None) => false,
+        (Some("T" | "t"), None) => true,
         _ => return Err(ParseError::Columns),
-    }
-    Ok(Some(LogLine { t_ns, bus, frame: parse(text)? }))
+    };
+    Ok(Some(LogLine { t_ns, bus, frame: parse(text)?, tx }))
 }
 
 fn parse_stamp(text: &str) -> Result<u64, ParseError> {
-    let stamp = || {
-        let inner = text.strip_prefix('(')?.strip_suffix(')')?;
-        let (seconds, fraction) = inner.split_once('.').unwrap_or((inner, "0"));
-        let seconds = hex::decimal(seconds.as_bytes())?;
-        if !fraction.bytes().all(|c| c.is_ascii_digit()) {
-            return None;
-        }
-        let nine = fraction.get(..9).unwrap_or(fraction);
-        let scale = 10u64.pow(9 - u32::try_from(nine.len()).ok()?);
-        let fraction_ns = hex::decimal(nine.as_bytes())? * scale;
-        seconds.checked_mul(1_000_000_000)?.checked_add(fraction_ns)
-    };
-    stamp().ok_or_else(|| ParseError::Stamp(text.chars().take(40).collect()))
+    let inner = text.strip_prefix('(').and_then(|t| t.strip_suffix(')'));
+    inner
+        .and_then(super::logfile::seconds)
+        .ok_or_else(|| ParseError::Stamp(text.chars().take(40).collect()))
 }
 
 /// One line as `candump -L` writes it, without line end.
@@ -376,7 +370,7 @@ mod tests {
         fn round_trip(frame in any_frame(true), t_us in 0u64..4_000_000_000_000_000) {
             prop_assert_eq!(parse(&format(&frame)), Ok(frame));
             let line = format_log_line(t_us * 1000, "can0", &frame);
-            let expected = LogLine { t_ns: t_us * 1000, bus: "can0", frame };
+            let expected = LogLine { t_ns: t_us * 1000, bus: "can0", frame, tx: false };
             prop_assert_eq!(parse_log_line(&line), Ok(Some(expected)));
         }
 

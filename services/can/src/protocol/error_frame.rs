@@ -130,7 +130,7 @@ impl ErrorFrame {
             }
         }
         if self.has(CLASS_TRANSCEIVER) {
-            say(&format!("transceiver: {}", transceiver(self.data[4])));
+            transceiver(self.data[4], &mut say);
         }
         for (class, text) in [
             (CLASS_NO_ACK, "no acknowledgement"),
@@ -205,18 +205,22 @@ fn place(code: u8) -> Option<&'static str> {
     })
 }
 
-fn transceiver(code: u8) -> &'static str {
-    match code {
-        0x04 => "CANH has no wire",
-        0x05 => "CANH shorted to battery",
-        0x06 => "CANH shorted to VCC",
-        0x07 => "CANH shorted to ground",
-        0x40 => "CANL has no wire",
-        0x50 => "CANL shorted to battery",
-        0x60 => "CANL shorted to VCC",
-        0x70 => "CANL shorted to ground",
-        0x80 => "CANL shorted to CANH",
-        _ => "unspecified fault",
+/// CANH in the low half of the code, CANL in the high half; both may have a fault.
+fn transceiver(code: u8, say: &mut impl FnMut(&str)) {
+    if code == 0 {
+        say("transceiver: unspecified fault");
+    }
+    for (wire, fault) in [("CANH", code & 0x0F), ("CANL", code >> 4)] {
+        let what = match fault {
+            0 => continue,
+            4 => "has no wire",
+            5 => "shorted to battery",
+            6 => "shorted to VCC",
+            7 => "shorted to ground",
+            8 if wire == "CANL" => "shorted to CANH",
+            _ => "unspecified fault",
+        };
+        say(&format!("transceiver: {wire} {what}"));
     }
 }
 
@@ -242,7 +246,20 @@ mod tests {
             ),
             ("20000002#0500000000000000", "lost arbitration in bit 5"),
             ("20000010#0000000007000000", "transceiver: CANH shorted to ground"),
+            ("20000010#0000000044000000", "transceiver: CANH has no wire; transceiver: CANL has no wire"),
+            ("20000010#0000000080000000", "transceiver: CANL shorted to CANH"),
+            ("20000010#0000000000000000", "transceiver: unspecified fault"),
             ("20000001#0000000000000000", "transmission timed out"),
+            (
+                "20000008#0000FF0A00000000",
+                "bit error; form error; stuff error; cannot send a dominant bit; cannot send a recessive bit; bus overload; active error flag; while sending; in the data",
+            ),
+            (
+                "20000004#007F000000000000",
+                "receive buffer overflow; transmit buffer overflow; error warning by receive errors; error warning by transmit errors; error passive by receive errors; error passive by transmit errors; error active again",
+            ),
+            ("20000200#000000000000A1B2", "TEC 161, REC 178"),
+            ("20000028#0000001B00000000", "protocol violation; in the acknowledge delimiter; no acknowledgement"),
             ("20000000#0000000000000000", "error without a reason"),
             ("20001000#0000000000000000", "unknown class 1000h"),
         ];

@@ -186,3 +186,7 @@ impl VirtualBus {
         self.wire.as_ref().map(|wire| wire.counters)
     }
 }
+
+#[cfg(test)]
+#[path = "wire_side_tests.rs"]
+mod tests;

@@ -3,6 +3,7 @@
 //! A backend is one task. It opens its wire, moves frames between wire and [`Hub`], and when the wire goes away it says so
 //! once and tries again with back-off, for ever: adapters are pulled and plugged in again. It never ends the service.
 
+pub mod filter;
 pub mod netlink;
 pub mod port;
 pub mod remote;
@@ -50,6 +51,8 @@ pub struct LinkStatus {
     pub kernel_drops: u64,
     /// Times the kernel's transmit queue was full.
     pub tx_busy: u64,
+    /// Filters in the kernel; 0: every frame comes.
+    pub filters: usize,
     /// The last error frame in words.
     pub last_error: Option<String>,
     /// Why it is down, with the remedy.
@@ -123,7 +126,9 @@ impl<H: Host + 'static> Line<H> {
             }
         };
         let interface = self.status.borrow().interface.clone();
-        self.say(level, format!("{interface} is {}: {words}", state.words()));
+        let state = state.words();
+        let why = if words == state { String::new() } else { format!(": {words}") };
+        self.say(level, format!("{interface} is {state}{why}"));
     }
 }
 

@@ -12,7 +12,7 @@ use crate::protocol::error_frame::ControllerState;
 pub enum LinkError {
     /// Not there.
     #[error(
-        "there is no interface '{name}' ({known}): plug the adapter in or load its driver; `ip -brief link` lists what there is"
+        "there is no interface '{name}' ({known}): plug the adapter in or load its driver; `ip link add dev {name} type vcan` makes one without hardware"
     )]
     Absent {
         /// Its name.
@@ -80,8 +80,10 @@ pub struct Interface {
     pub bitrate: Option<u32>,
     /// Data bit rate in bit/s.
     pub data_bitrate: Option<u32>,
-    /// Has a bit rate that can be set.
+    /// Has a controller with a bit rate that can be set.
     pub settable: bool,
+    /// Belongs to a device. Serial line disciplines (slcan, can327) do not.
+    pub device: bool,
     /// The kernel's own pause before a restart; 0 = it restarts never.
     pub restart_ms: Option<u32>,
     /// State of the controller.
@@ -110,7 +112,13 @@ fn denied(e: &LinkError) -> bool {
 }
 
 fn open(name: &str) -> Result<CanInterface, LinkError> {
-    CanInterface::open(name).map_err(|_| LinkError::Absent { name: name.to_owned(), known: known() })
+    CanInterface::open(name).map_err(|_| {
+        if supported() {
+            LinkError::Absent { name: name.to_owned(), known: known() }
+        } else {
+            LinkError::NoCan
+        }
+    })
 }
 
 /// The CAN interfaces of this machine, for messages: "there are: can0, vcan0".
@@ -143,9 +151,11 @@ pub fn look(name: &str) -> Result<Interface, LinkError> {
         index: details.index,
         up: details.is_up,
         fd: details.mtu == Some(Mtu::Fd),
-        bitrate: can.bit_timing.map(|t| t.bitrate).filter(|&rate| rate > 0),
+        // slcand's interfaces say 2^32-1 for a rate that nobody told them.
+        bitrate: can.bit_timing.map(|t| t.bitrate).filter(|&rate| rate > 0 && rate < u32::MAX),
         data_bitrate: can.data_bit_timing.map(|t| t.bitrate).filter(|&rate| rate > 0),
         settable: can.clock.is_some() || can.bit_timing_const.is_some(),
+        device: std::path::Path::new("/sys/class/net").join(name).join("device").exists(),
         restart_ms: can.restart_ms,
         state,
         counters: can.berr_counter.map(|c| (c.txerr, c.rxerr)),
@@ -153,14 +163,15 @@ pub fn look(name: &str) -> Result<Interface, LinkError> {
 }
 
 /// The command that makes the interface as wanted.
-pub fn command(wanted: &Wanted, has_rate: bool) -> String {
+pub fn command(wanted: &Wanted, is: &Interface) -> String {
     let mut text = format!("ip link set {} up", wanted.name);
-    if has_rate {
+    if is.settable {
         text += &format!(" type can bitrate {}", wanted.bitrate);
         if wanted.fd == Some(true) {
             text += &format!(" dbitrate {} fd on", wanted.data_bitrate);
         }
-        if wanted.restart_ms > 0 {
+        // Kernels before 6.16 crash when a line discipline is to be restarted.
+        if wanted.restart_ms > 0 && is.device {
             text += &format!(" restart-ms {}", wanted.restart_ms);
         }
     }
@@ -192,19 +203,17 @@ pub fn prepare(wanted: &Wanted) -> Result<(Interface, Option<String>), LinkError
     let is = look(&wanted.name)?;
     let differ = differences(wanted, &is);
     let no_rate_yet = is.settable && is.bitrate.is_none();
-    let restart_differs = is.settable && is.restart_ms != Some(wanted.restart_ms);
-    if is.up && differ.is_empty() && !(restart_differs && wanted.configure) {
+    if is.up && differ.is_empty() {
         return Ok((is, None));
     }
     if wanted.configure {
         match set(wanted, &is, !differ.is_empty() || no_rate_yet) {
             Ok(done) => return Ok((look(&wanted.name)?, Some(done))),
             Err(e) if !denied(&e) => return Err(e),
-            Err(_) if is.up && differ.is_empty() => return Ok((is, None)),
             Err(_) => {}
         }
     }
-    let command = command(wanted, is.settable);
+    let command = command(wanted, &is);
     if !is.up {
         let why = if wanted.configure {
             " as root, or give this process CAP_NET_ADMIN"
@@ -236,17 +245,33 @@ fn set(wanted: &Wanted, is: &Interface, timing: bool) -> Result<String, LinkErro
             link.set_ctrlmode(CanCtrlMode::Fd, true).map_err(system(name, "switching CAN FD on"))?;
         }
     }
-    if is.settable && is.restart_ms != Some(wanted.restart_ms) {
-        // Drivers refuse it while up; then the restart is ours to do.
-        let _ = link.set_restart_ms(wanted.restart_ms);
+    if is.settable && is.restart_ms.is_some_and(|ms| ms > 0) {
+        // Who may set the bit rate may restart: the kernel's own restart knows no back-off.
+        let _ = link.set_restart_ms(0);
     }
     link.bring_up().map_err(system(name, "raising it"))?;
-    Ok(format!("interface {name}: did what `{}` does", command(wanted, is.settable)))
+    Ok(format!("interface {name}: did what `{}` does", command(&Wanted { restart_ms: 0, ..wanted.clone() }, is)))
 }
 
-/// Restarts the controller after bus-off.
-pub fn restart(name: &str) -> Result<(), LinkError> {
-    open(name)?.restart().map_err(system(name, "restarting it after bus-off"))
+/// Restarts the controller after bus-off. A line discipline has no restart (and kernels before 6.16 crash when asked for
+/// one): it is taken down and raised again.
+pub fn restart(name: &str, is: &Interface) -> Result<(), LinkError> {
+    let link = open(name)?;
+    if is.device {
+        return link.restart().map_err(system(name, "restarting it after bus-off"));
+    }
+    link.bring_down().map_err(system(name, "taking it down after bus-off"))?;
+    link.bring_up().map_err(system(name, "raising it after bus-off"))
+}
+
+/// Whether this kernel has CAN.
+pub fn supported() -> bool {
+    use rustix::net::{AddressFamily, Protocol, SocketType, socket};
+    let family = AddressFamily::from_raw(libc::AF_CAN as u16);
+    let raw = Protocol::from_raw(std::num::NonZero::<u32>::MIN);
+    // Any other refusal is not the kernel's lack of it.
+    let lacks = [rustix::io::Errno::AFNOSUPPORT, rustix::io::Errno::PROTONOSUPPORT];
+    !socket(family, SocketType::RAW, Some(raw)).is_err_and(|e| lacks.contains(&e))
 }
 
 #[cfg(test)]
@@ -279,10 +304,12 @@ mod tests {
             ]
         );
         assert_eq!(
-            command(&fd, true),
+            command(&fd, &Interface { settable: true, device: true, ..Interface::default() }),
             "ip link set can0 up type can bitrate 500000 dbitrate 2000000 fd on restart-ms 100"
         );
-        assert_eq!(command(&wanted(), false), "ip link set can0 up");
+        assert_eq!(command(&wanted(), &Interface::default()), "ip link set can0 up");
+        let line = Interface { settable: true, ..Interface::default() };
+        assert_eq!(command(&wanted(), &line), "ip link set can0 up type can bitrate 500000");
     }
 
     #[test]
@@ -293,7 +320,7 @@ mod tests {
             LinkError::NotCan("eth0".into()),
             LinkError::Down {
                 name: "can0".into(),
-                command: command(&wanted(), true),
+                command: command(&wanted(), &Interface { settable: true, device: true, ..Interface::default() }),
                 why: " as root, or give this process CAP_NET_ADMIN",
             },
             LinkError::System {
@@ -303,7 +330,7 @@ mod tests {
             },
         ];
         insta::assert_snapshot!(all.map(|e| e.to_string()).join("\n"), @r#"
-        there is no interface 'can7' (CAN interfaces here: can0, vcan0): plug the adapter in or load its driver; `ip -brief link` lists what there is
+        there is no interface 'can7' (CAN interfaces here: can0, vcan0): plug the adapter in or load its driver; `ip link add dev can7 type vcan` makes one without hardware
         this kernel has no SocketCAN: load it with `modprobe can_raw`, or use backend = "slcan" for a serial adapter
         interface 'eth0' is no CAN interface
         interface can0 is down: run `ip link set can0 up type can bitrate 500000 restart-ms 100` as root, or give this process CAP_NET_ADMIN
@@ -314,6 +341,8 @@ mod tests {
     #[test]
     fn an_interface_that_is_not_there() {
         let error = prepare(&Wanted { name: "nocan42".into(), ..wanted() }).unwrap_err();
-        assert!(matches!(error, LinkError::Absent { .. }), "{error}");
+        // A kernel without CAN is named first: then there is nothing to plug in.
+        assert_eq!(matches!(error, LinkError::Absent { .. }), supported(), "{error}");
+        assert_eq!(matches!(error, LinkError::NoCan), !supported(), "{error}");
     }
 }

@@ -13,6 +13,7 @@ use ipc_types::event::Level;
 use socketcan::{CanFdSocket, Socket, SocketOptions};
 use tokio::io::unix::AsyncFd;
 
+use super::filter::Filter;
 use super::netlink::{self, Interface, LinkError, Wanted};
 use super::{BackOff, Line, NO_ACK_NS};
 use crate::protocol::Frame;
@@ -41,6 +42,8 @@ pub struct Settings {
     pub wanted: Wanted,
     /// Receive buffer of the socket in bytes.
     pub rx_buffer: usize,
+    /// Which frames the kernel hands over; empty: all.
+    pub filters: Vec<Filter>,
 }
 
 /// Works for ever. Must run inside a `LocalSet`; the bus must have its wire attached.
@@ -99,6 +102,10 @@ fn socket(settings: &Settings) -> io::Result<AsyncFd<OwnedFd>> {
     const ALL_ERRORS: u32 = 0x1FFF_FFFF;
     let socket = CanFdSocket::open(&settings.wanted.name)?;
     socket.set_nonblocking(true)?;
+    if !settings.filters.is_empty() {
+        let raw: Vec<_> = settings.filters.iter().map(|f| f.raw()).collect();
+        socket.set_filters(&raw)?;
+    }
     socket.set_recv_own_msgs(true)?;
     socket.set_error_filter(ALL_ERRORS)?;
     socket.set_socket_option_int(libc::SOL_SOCKET, libc::SO_TIMESTAMPNS, 1)?;
@@ -167,10 +174,11 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
         if self.interface.up {
             self.raised();
         }
+        self.line.status.borrow_mut().filters = self.settings.filters.len();
         let hub = self.line.hub.clone();
         loop {
             let up = self.line.status.borrow().up;
-            let look = if up { self.restart_pause().unwrap_or(LOOK) } else { DOWN_LOOK };
+            let look = if up { self.until_restart().unwrap_or(LOOK) } else { DOWN_LOOK };
             let end = tokio::select! {
                 ready = self.socket.readable() => match ready {
                     Ok(mut guard) => {
@@ -287,12 +295,18 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
         }
         let hub = self.line.hub.clone();
         let fd_capable = self.interface.fd;
-        let failed = hub.turn(|bus, _, now_ns| {
+        let filters = &self.settings.filters;
+        let failed = hub.turn(|bus, host, now_ns| {
             loop {
                 let waiting = self.held.take();
                 let frame = waiting.or_else(|| bus.wire_next(now_ns, |f| fd_capable || !f.is_fd()))?;
                 let (bytes, n) = sys::to_kernel(&frame);
                 match rustix::io::write(self.socket.get_ref(), &bytes[..n]) {
+                    // Its echo would not pass the filters.
+                    Ok(_) if !filters.is_empty() && !filters.iter().any(|f| f.passes(frame.can_id)) => {
+                        self.last_ns = self.last_ns.max(now_ns);
+                        bus.wire_echo(&frame, self.last_ns, host);
+                    }
                     Ok(_) => {}
                     Err(rustix::io::Errno::INTR) => self.held = Some(frame),
                     Err(e) => {
@@ -332,7 +346,7 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
         self.held = None;
         self.restart_at_ns = None;
         let wanted = &self.settings.wanted;
-        let command = netlink::command(wanted, self.interface.settable);
+        let command = netlink::command(wanted, &self.interface);
         self.line.down(format!(
             "interface {} is down: frames wait until it is up again (`{command}`)",
             wanted.name
@@ -357,19 +371,26 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
             (true, true) => {
                 self.note();
                 self.restart_if_due();
-                let now_ns = clock::mono_ns();
-                let since_ns = self.line.hub.look(|bus, _| bus.wire_overdue(now_ns));
-                if since_ns.is_some_and(|since_ns| since_ns + NO_ACK_NS < now_ns) && !self.no_ack_said {
-                    self.no_ack_said = true;
-                    self.line.say(
-                        Level::Warning,
-                        format!("interface {name}: nobody acknowledges what is sent: termination, bit rate, partner?"),
-                    );
-                }
+                self.watch_acknowledgements();
             }
             (false, false) => {}
         }
         self.exchange()
+    }
+
+    fn watch_acknowledgements(&mut self) {
+        let now_ns = clock::mono_ns();
+        let since_ns = self.line.hub.look(|bus, _| bus.wire_overdue(now_ns));
+        if since_ns.is_some_and(|since_ns| since_ns + NO_ACK_NS < now_ns) && !self.no_ack_said {
+            self.no_ack_said = true;
+            self.line.say(
+                Level::Warning,
+                format!(
+                    "interface {}: nobody acknowledges what is sent: termination, bit rate, partner?",
+                    self.settings.wanted.name
+                ),
+            );
+        }
     }
 
     /// Takes over what the kernel tells about the controller.
@@ -405,7 +426,10 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
             self.no_ack_said = true;
             self.line.say(
                 Level::Warning,
-                format!("interface {}: {words}: termination, bit rate, partner?", self.settings.wanted.name),
+                format!(
+                    "interface {}: nobody acknowledges what is sent ({words}): termination, bit rate, partner?",
+                    self.settings.wanted.name
+                ),
             );
         }
     }
@@ -420,10 +444,14 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
         }
         self.held = None;
         self.line.hub.look(|bus, _| bus.wire_flush());
+        if !self.interface.settable {
+            // Without a controller there is nothing to restart.
+            return;
+        }
         let pause_ms = u64::from(self.settings.wanted.restart_ms);
         // The kernel does it by itself when it was told to.
         if pause_ms > 0 && self.interface.restart_ms.unwrap_or(0) == 0 {
-            let pause = Duration::from_millis(pause_ms << self.restarts.min(16)).min(MAX_RESTART);
+            let pause = restart_pause(Duration::from_millis(pause_ms), self.restarts);
             self.restart_at_ns = Some(clock::mono_ns() + pause.as_nanos() as u64);
         } else if pause_ms == 0 {
             self.line.say(
@@ -434,7 +462,7 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
         }
     }
 
-    fn restart_pause(&self) -> Option<Duration> {
+    fn until_restart(&self) -> Option<Duration> {
         let at_ns = self.restart_at_ns?;
         Some(Duration::from_nanos(at_ns.saturating_sub(clock::mono_ns()).max(1_000_000)).min(LOOK))
     }
@@ -444,9 +472,13 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
             return;
         }
         let name = &self.settings.wanted.name;
-        match netlink::restart(name) {
+        match netlink::restart(name, &self.interface) {
             Ok(()) => {
                 self.restarts += 1;
+                if !self.interface.device {
+                    // A device tells it by an error frame.
+                    self.line.status.borrow_mut().restarts += 1;
+                }
                 self.restart_at_ns = None;
             }
             Err(e) => {
@@ -459,3 +491,12 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
         }
     }
 }
+
+/// Pause before the restart after so many that did not help: doubled each time, up to 5 s or what the first one is.
+fn restart_pause(first: Duration, restarts: u32) -> Duration {
+    (first * (1 << restarts.min(16))).min(MAX_RESTART.max(first))
+}
+
+#[cfg(test)]
+#[path = "socketcan_tests.rs"]
+mod tests;

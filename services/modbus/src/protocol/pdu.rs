@@ -6,6 +6,7 @@
 //! [`crate::server`].
 
 use super::wire::{Writer, u16_at};
+use super::{diagnostics, files, identification};
 
 /// Largest PDU in bytes: 256 bytes of serial ADU less address and CRC (V1.1b3 clause 4.1).
 pub const MAX_PDU: usize = 253;
@@ -24,7 +25,7 @@ pub const COIL_ON: u16 = 0xFF00;
 /// Set in the function code of an exception response (V1.1b3 clause 7).
 pub const EXCEPTION_BIT: u8 = 0x80;
 
-/// Function codes served (V1.1b3 clause 5.1).
+/// The public function codes (V1.1b3 clause 5.1).
 pub mod function {
     /// Read coils, clause 6.1.
     pub const READ_COILS: u8 = 1;
@@ -38,18 +39,47 @@ pub mod function {
     pub const WRITE_SINGLE_COIL: u8 = 5;
     /// Write single register, clause 6.6.
     pub const WRITE_SINGLE_REGISTER: u8 = 6;
+    /// Read exception status, serial line only, clause 6.7.
+    pub const READ_EXCEPTION_STATUS: u8 = 7;
+    /// Diagnostics, serial line only, clause 6.8.
+    pub const DIAGNOSTICS: u8 = 8;
+    /// Get comm event counter, serial line only, clause 6.9.
+    pub const GET_COMM_EVENT_COUNTER: u8 = 11;
+    /// Get comm event log, serial line only, clause 6.10.
+    pub const GET_COMM_EVENT_LOG: u8 = 12;
     /// Write multiple coils, clause 6.11.
     pub const WRITE_MULTIPLE_COILS: u8 = 15;
     /// Write multiple registers, clause 6.12.
     pub const WRITE_MULTIPLE_REGISTERS: u8 = 16;
+    /// Report server ID, serial line only, clause 6.13.
+    pub const REPORT_SERVER_ID: u8 = 17;
+    /// Read file record, clause 6.14.
+    pub const READ_FILE_RECORD: u8 = 20;
+    /// Write file record, clause 6.15.
+    pub const WRITE_FILE_RECORD: u8 = 21;
     /// Mask write register, clause 6.16.
     pub const MASK_WRITE_REGISTER: u8 = 22;
     /// Read/write multiple registers, clause 6.17.
     pub const READ_WRITE_MULTIPLE_REGISTERS: u8 = 23;
+    /// Read FIFO queue, clause 6.18.
+    pub const READ_FIFO_QUEUE: u8 = 24;
+    /// Encapsulated interface transport, clause 6.19.
+    pub const ENCAPSULATED_INTERFACE: u8 = 43;
+
+    /// Whether V1.1b3 marks the code as one for serial lines only.
+    pub fn is_serial_line_only(code: u8) -> bool {
+        matches!(
+            code,
+            READ_EXCEPTION_STATUS
+                | DIAGNOSTICS
+                | GET_COMM_EVENT_COUNTER
+                | GET_COMM_EVENT_LOG
+                | REPORT_SERVER_ID
+        )
+    }
 }
 
 /// Name of a public function code as V1.1b3 clause 5.1 writes it; `None` for codes that are not public.
-/// Of these only the ones in [`function`] are served, the others are answered by exception 01.
 pub fn function_name(code: u8) -> Option<&'static str> {
     Some(match code {
         1 => "Read Coils",
@@ -91,6 +121,8 @@ pub enum Exception {
     Acknowledge = 0x05,
     /// 06: try again, a queue is full.
     ServerDeviceBusy = 0x06,
+    /// 07: the request cannot be performed (programming commands; V1.1b3 counts it in 8/10h).
+    NegativeAcknowledge = 0x07,
     /// 08: a file record is damaged.
     MemoryParityError = 0x08,
     /// 0A: the unit addressed is not configured here.
@@ -114,6 +146,7 @@ impl Exception {
             0x04 => Self::ServerDeviceFailure,
             0x05 => Self::Acknowledge,
             0x06 => Self::ServerDeviceBusy,
+            0x07 => Self::NegativeAcknowledge,
             0x08 => Self::MemoryParityError,
             0x0A => Self::GatewayPathUnavailable,
             0x0B => Self::GatewayTargetFailedToRespond,
@@ -146,6 +179,26 @@ pub enum Request<'a> {
     MaskWriteRegister { address: u16, and_mask: u16, or_mask: u16 },
     /// Function 23, write (1-121 registers) before read (1-125).
     ReadWriteMultipleRegisters { read_address: u16, read_quantity: u16, write_address: u16, values: &'a [u8] },
+    /// Function 7.
+    ReadExceptionStatus,
+    /// Function 8, sub-functions of [`diagnostics::sub`].
+    Diagnostics { sub_function: u16, data: &'a [u8] },
+    /// Function 11.
+    GetCommEventCounter,
+    /// Function 12.
+    GetCommEventLog,
+    /// Function 17.
+    ReportServerId,
+    /// Function 20; the groups as [`files::read_groups`] walks them.
+    ReadFileRecord { groups: &'a [u8] },
+    /// Function 21; the groups as [`files::write_groups`] walks them.
+    WriteFileRecord { groups: &'a [u8] },
+    /// Function 24.
+    ReadFifoQueue { address: u16 },
+    /// Function 43, MEI type 14: `code` of [`identification::code`], first or only object.
+    ReadDeviceIdentification { code: u8, object: u8 },
+    /// Function 43, MEI type 13: what follows the MEI type.
+    CanopenGeneralReference { data: &'a [u8] },
 }
 
 /// A request that is answered by an exception before the device is asked.
@@ -184,6 +237,17 @@ impl Request<'_> {
             Self::WriteMultipleRegisters { .. } => function::WRITE_MULTIPLE_REGISTERS,
             Self::MaskWriteRegister { .. } => function::MASK_WRITE_REGISTER,
             Self::ReadWriteMultipleRegisters { .. } => function::READ_WRITE_MULTIPLE_REGISTERS,
+            Self::ReadExceptionStatus => function::READ_EXCEPTION_STATUS,
+            Self::Diagnostics { .. } => function::DIAGNOSTICS,
+            Self::GetCommEventCounter => function::GET_COMM_EVENT_COUNTER,
+            Self::GetCommEventLog => function::GET_COMM_EVENT_LOG,
+            Self::ReportServerId => function::REPORT_SERVER_ID,
+            Self::ReadFileRecord { .. } => function::READ_FILE_RECORD,
+            Self::WriteFileRecord { .. } => function::WRITE_FILE_RECORD,
+            Self::ReadFifoQueue { .. } => function::READ_FIFO_QUEUE,
+            Self::ReadDeviceIdentification { .. } | Self::CanopenGeneralReference { .. } => {
+                function::ENCAPSULATED_INTERFACE
+            }
         }
     }
 
@@ -206,6 +270,18 @@ impl Request<'_> {
             Self::ReadWriteMultipleRegisters { read_quantity, values, .. } => {
                 (1..=MAX_READ_WORDS).contains(&read_quantity) && is_words(values, MAX_READ_WRITE_WORDS)
             }
+            Self::ReadExceptionStatus
+            | Self::GetCommEventCounter
+            | Self::GetCommEventLog
+            | Self::ReportServerId
+            | Self::ReadFifoQueue { .. } => true,
+            Self::Diagnostics { sub_function, data } => diagnostics::is_request_data(sub_function, data),
+            Self::ReadFileRecord { groups } => files::is_read_request(groups),
+            Self::WriteFileRecord { groups } => files::is_write_request(groups),
+            Self::ReadDeviceIdentification { code, .. } => {
+                (identification::code::BASIC..=identification::code::INDIVIDUAL).contains(&code)
+            }
+            Self::CanopenGeneralReference { data } => data.len() <= MAX_PDU - 2,
         }
     }
 }
@@ -221,21 +297,53 @@ pub fn bytes_for_bits(quantity: u16) -> usize {
 
 /// Reads a request PDU, function code first.
 ///
-/// Checks in the order of V1.1b3 figure 9: an unserved function code is refused with exception 01 whatever
-/// follows it; then a length that does not fit the function (short or with trailing bytes), a quantity out of
-/// range, a byte count that does not fit the quantity, or a coil value other than 0000 and FF00 with
-/// exception 03. An empty PDU (no transport delivers one) counts as function 0.
+/// Checks in the order of V1.1b3 figure 9: an unknown or obsolete function code, sub-function of function 8 or MEI
+/// type of function 43 is refused with exception 01 whatever follows it; then a length that does not fit the
+/// function (short or with trailing bytes), a quantity out of range, a byte count that does not fit the quantity,
+/// groups that do not fit together, or a value the function does not have with exception 03. An empty PDU (no
+/// transport delivers one) counts as function 0.
 pub fn decode_request(pdu: &[u8]) -> Result<Request<'_>, Refused> {
     let (function, data) = match pdu.split_first() {
         Some((&function, data)) => (function, data),
         None => return Err(Refused { function: 0, exception: Exception::IllegalFunction }),
     };
+    let plain = |request| data.is_empty().then_some(request);
     let request = match function {
         function::READ_COILS..=function::WRITE_SINGLE_REGISTER => decode_two_words(function, data),
+        function::READ_EXCEPTION_STATUS => plain(Request::ReadExceptionStatus),
+        function::DIAGNOSTICS => match u16_at(data, 0) {
+            Some(sub) if !diagnostics::sub::ALL.contains(&sub) => {
+                return Err(Refused { function, exception: Exception::IllegalFunction });
+            }
+            Some(sub_function) => Some(Request::Diagnostics { sub_function, data: &data[2..] }),
+            None => None,
+        },
+        function::GET_COMM_EVENT_COUNTER => plain(Request::GetCommEventCounter),
+        function::GET_COMM_EVENT_LOG => plain(Request::GetCommEventLog),
+        function::REPORT_SERVER_ID => plain(Request::ReportServerId),
         function::WRITE_MULTIPLE_COILS => decode_write_coils(data),
         function::WRITE_MULTIPLE_REGISTERS => decode_write_registers(data),
+        function::READ_FILE_RECORD => {
+            counted_values(data, 0).map(|groups| Request::ReadFileRecord { groups })
+        }
+        function::WRITE_FILE_RECORD => {
+            counted_values(data, 0).map(|groups| Request::WriteFileRecord { groups })
+        }
         function::MASK_WRITE_REGISTER => decode_mask_write(data),
         function::READ_WRITE_MULTIPLE_REGISTERS => decode_read_write(data),
+        function::READ_FIFO_QUEUE => match data {
+            &[high, low] => Some(Request::ReadFifoQueue { address: u16::from_be_bytes([high, low]) }),
+            _ => None,
+        },
+        function::ENCAPSULATED_INTERFACE => match data {
+            &[identification::MEI_DEVICE_IDENTIFICATION, ref rest @ ..] => match rest {
+                &[code, object] => Some(Request::ReadDeviceIdentification { code, object }),
+                _ => None,
+            },
+            &[identification::MEI_CANOPEN, ref data @ ..] => Some(Request::CanopenGeneralReference { data }),
+            [] => None,
+            _ => return Err(Refused { function, exception: Exception::IllegalFunction }),
+        },
         _ => return Err(Refused { function, exception: Exception::IllegalFunction }),
     };
     match request {
@@ -348,6 +456,26 @@ pub fn encode_request(request: &Request<'_>, out: &mut [u8]) -> Result<usize, En
             w.u16((values.len() / 2) as u16)?;
             w.u8(values.len() as u8)?;
             w.bytes(values)?;
+        }
+        Request::ReadExceptionStatus
+        | Request::GetCommEventCounter
+        | Request::GetCommEventLog
+        | Request::ReportServerId => {}
+        Request::Diagnostics { sub_function, data } => {
+            w.u16(sub_function)?;
+            w.bytes(data)?;
+        }
+        Request::ReadFileRecord { groups } | Request::WriteFileRecord { groups } => {
+            w.u8(groups.len() as u8)?;
+            w.bytes(groups)?;
+        }
+        Request::ReadFifoQueue { address } => w.u16(address)?,
+        Request::ReadDeviceIdentification { code, object } => {
+            w.bytes(&[identification::MEI_DEVICE_IDENTIFICATION, code, object])?;
+        }
+        Request::CanopenGeneralReference { data } => {
+            w.u8(identification::MEI_CANOPEN)?;
+            w.bytes(data)?;
         }
     }
     Ok(w.len())

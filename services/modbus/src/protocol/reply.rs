@@ -1,10 +1,14 @@
 //! Responses: written by servers, read by clients.
 
 use super::pdu::{
-    COIL_ON, EXCEPTION_BIT, EncodeError, MAX_READ_BITS, MAX_READ_WORDS, MAX_WRITE_BITS, MAX_WRITE_WORDS,
-    Request, bytes_for_bits, function,
+    COIL_ON, EXCEPTION_BIT, EncodeError, MAX_PDU, MAX_READ_BITS, MAX_READ_WORDS, MAX_WRITE_BITS,
+    MAX_WRITE_WORDS, Request, bytes_for_bits, function,
 };
 use super::wire::{Writer, u16_at};
+use super::{diagnostics, files, identification};
+
+/// Most events of a log (V1.1b3 clause 6.10).
+pub const MAX_EVENTS: usize = 64;
 
 /// A response. Coil values are packed low bit first, register values are the wire's big-endian bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,6 +33,27 @@ pub enum Response<'a> {
     MaskWriteRegister { address: u16, and_mask: u16, or_mask: u16 },
     /// Function 23, the registers read.
     ReadWriteMultipleRegisters(&'a [u8]),
+    /// Function 7, eight bits.
+    ReadExceptionStatus(u8),
+    /// Function 8. To sub-function 4 there is no response.
+    Diagnostics { sub_function: u16, data: &'a [u8] },
+    /// Function 11: status FFFFh = busy with an earlier program command.
+    GetCommEventCounter { status: u16, events: u16 },
+    /// Function 12: the newest event first, at most [`MAX_EVENTS`].
+    GetCommEventLog { status: u16, events: u16, messages: u16, log: &'a [u8] },
+    /// Function 17, device specific: id, run indicator (00 or FF), more.
+    ReportServerId(&'a [u8]),
+    /// Function 20; the groups as [`files::answered_groups`] walks them.
+    ReadFileRecord { groups: &'a [u8] },
+    /// Function 21, echo of the request.
+    WriteFileRecord { groups: &'a [u8] },
+    /// Function 24: the registers queued, at most [`files::MAX_FIFO`].
+    ReadFifoQueue(&'a [u8]),
+    /// Function 43/14; the objects as [`identification::objects`] walks them. `next` is the object to ask for
+    /// when `more` follow.
+    ReadDeviceIdentification { code: u8, conformity: u8, more: bool, next: u8, objects: &'a [u8] },
+    /// Function 43/13: what follows the MEI type.
+    CanopenGeneralReference { data: &'a [u8] },
     /// Any function: `function` without the top bit, `code` as received (it need not be a known one).
     Exception { function: u8, code: u8 },
 }
@@ -64,6 +89,17 @@ impl Response<'_> {
             Self::WriteMultipleRegisters { .. } => function::WRITE_MULTIPLE_REGISTERS,
             Self::MaskWriteRegister { .. } => function::MASK_WRITE_REGISTER,
             Self::ReadWriteMultipleRegisters(_) => function::READ_WRITE_MULTIPLE_REGISTERS,
+            Self::ReadExceptionStatus(_) => function::READ_EXCEPTION_STATUS,
+            Self::Diagnostics { .. } => function::DIAGNOSTICS,
+            Self::GetCommEventCounter { .. } => function::GET_COMM_EVENT_COUNTER,
+            Self::GetCommEventLog { .. } => function::GET_COMM_EVENT_LOG,
+            Self::ReportServerId(_) => function::REPORT_SERVER_ID,
+            Self::ReadFileRecord { .. } => function::READ_FILE_RECORD,
+            Self::WriteFileRecord { .. } => function::WRITE_FILE_RECORD,
+            Self::ReadFifoQueue(_) => function::READ_FIFO_QUEUE,
+            Self::ReadDeviceIdentification { .. } | Self::CanopenGeneralReference { .. } => {
+                function::ENCAPSULATED_INTERFACE
+            }
             Self::Exception { function, .. } => function | EXCEPTION_BIT,
         }
     }
@@ -84,7 +120,21 @@ impl Response<'_> {
             Self::WriteSingleCoil { .. }
             | Self::WriteSingleRegister { .. }
             | Self::MaskWriteRegister { .. }
+            | Self::ReadExceptionStatus(_)
+            | Self::GetCommEventCounter { .. }
             | Self::Exception { .. } => true,
+            Self::Diagnostics { sub_function, data } => {
+                diagnostics::sub::ALL.contains(&sub_function) && diagnostics::is_words(data)
+            }
+            Self::GetCommEventLog { log, .. } => log.len() <= MAX_EVENTS,
+            Self::ReportServerId(data) => data.len() <= MAX_PDU - 2,
+            Self::ReadFileRecord { groups } => files::is_read_response(groups),
+            Self::WriteFileRecord { groups } => files::is_write_request(groups),
+            Self::ReadFifoQueue(values) => {
+                values.len().is_multiple_of(2) && values.len() / 2 <= files::MAX_FIFO
+            }
+            Self::ReadDeviceIdentification { objects, .. } => identification::count(objects).is_some(),
+            Self::CanopenGeneralReference { data } => data.len() <= MAX_PDU - 2,
         }
     }
 }
@@ -122,6 +172,43 @@ pub fn encode_response(response: &Response<'_>, out: &mut [u8]) -> Result<usize,
             w.u16(address)?;
             w.u16(and_mask)?;
             w.u16(or_mask)?;
+        }
+        Response::ReadExceptionStatus(status) => w.u8(status)?,
+        Response::Diagnostics { sub_function, data } => {
+            w.u16(sub_function)?;
+            w.bytes(data)?;
+        }
+        Response::GetCommEventCounter { status, events } => {
+            w.u16(status)?;
+            w.u16(events)?;
+        }
+        Response::GetCommEventLog { status, events, messages, log } => {
+            w.u8((6 + log.len()) as u8)?;
+            w.u16(status)?;
+            w.u16(events)?;
+            w.u16(messages)?;
+            w.bytes(log)?;
+        }
+        Response::ReportServerId(bytes)
+        | Response::ReadFileRecord { groups: bytes }
+        | Response::WriteFileRecord { groups: bytes } => {
+            w.u8(bytes.len() as u8)?;
+            w.bytes(bytes)?;
+        }
+        Response::ReadFifoQueue(values) => {
+            w.u16((2 + values.len()) as u16)?;
+            w.u16((values.len() / 2) as u16)?;
+            w.bytes(values)?;
+        }
+        Response::ReadDeviceIdentification { code, conformity, more, next, objects } => {
+            let more = if more { 0xFF } else { 0 };
+            let count = identification::count(objects).unwrap_or(0);
+            w.bytes(&[identification::MEI_DEVICE_IDENTIFICATION, code, conformity, more, next, count])?;
+            w.bytes(objects)?;
+        }
+        Response::CanopenGeneralReference { data } => {
+            w.u8(identification::MEI_CANOPEN)?;
+            w.bytes(data)?;
         }
         Response::Exception { code, .. } => w.u8(code)?,
     }
@@ -178,8 +265,80 @@ pub fn decode_response<'a>(request: &Request<'_>, pdu: &'a [u8]) -> Result<Respo
             echo(asked, data, &[address, and_mask, or_mask])?;
             Response::MaskWriteRegister { address, and_mask, or_mask }
         }
+        _ => decode_special(request, data).ok_or(ResponseError::Length { function: asked })??,
     };
     Ok(response)
+}
+
+/// Responses to the functions beyond tables. `None`: the length does not fit.
+fn decode_special<'a>(
+    request: &Request<'_>,
+    data: &'a [u8],
+) -> Option<Result<Response<'a>, ResponseError>> {
+    let function = request.function();
+    let all = |at: usize| data.get(at..).filter(|rest| data.get(at - 1) == u8::try_from(rest.len()).ok().as_ref());
+    let response = match *request {
+        Request::ReadExceptionStatus => match data {
+            &[status] => Response::ReadExceptionStatus(status),
+            _ => return None,
+        },
+        Request::Diagnostics { sub_function, data: asked } => {
+            let answered = data.get(2..).filter(|answered| diagnostics::is_words(answered))?;
+            let repeats = matches!(sub_function, diagnostics::sub::RETURN_QUERY_DATA);
+            if u16_at(data, 0) != Some(sub_function) || (repeats && answered != asked) {
+                return Some(Err(ResponseError::Echo { function }));
+            }
+            Response::Diagnostics { sub_function, data: answered }
+        }
+        Request::GetCommEventCounter => {
+            (data.len() == 4).then_some(())?;
+            Response::GetCommEventCounter { status: u16_at(data, 0)?, events: u16_at(data, 2)? }
+        }
+        Request::GetCommEventLog => {
+            let body = all(1)?;
+            Response::GetCommEventLog {
+                status: u16_at(body, 0)?,
+                events: u16_at(body, 2)?,
+                messages: u16_at(body, 4)?,
+                log: body.get(6..).filter(|log| log.len() <= MAX_EVENTS)?,
+            }
+        }
+        Request::ReportServerId => Response::ReportServerId(all(1)?),
+        Request::ReadFileRecord { groups } => {
+            let answered = all(1)?;
+            files::fits_request(groups, answered).then_some(Response::ReadFileRecord { groups: answered })?
+        }
+        Request::WriteFileRecord { groups } => {
+            let answered = all(1)?;
+            if answered != groups {
+                return Some(Err(ResponseError::Echo { function }));
+            }
+            Response::WriteFileRecord { groups: answered }
+        }
+        Request::ReadFifoQueue { .. } => {
+            let values = data.get(4..)?;
+            let (bytes, count) = (usize::from(u16_at(data, 0)?), usize::from(u16_at(data, 2)?));
+            let fits = bytes == values.len() + 2 && count * 2 == values.len() && count <= files::MAX_FIFO;
+            fits.then_some(Response::ReadFifoQueue(values))?
+        }
+        Request::ReadDeviceIdentification { code, .. } => {
+            let &[mei, answered, conformity, more, next, count, ref objects @ ..] = data else { return None };
+            let kind = mei == identification::MEI_DEVICE_IDENTIFICATION && answered == code;
+            if !kind || !matches!(more, 0 | 0xFF) {
+                return Some(Err(ResponseError::Echo { function }));
+            }
+            (identification::count(objects)? == count).then_some(())?;
+            Response::ReadDeviceIdentification { code, conformity, more: more != 0, next, objects }
+        }
+        Request::CanopenGeneralReference { .. } => match data {
+            [identification::MEI_CANOPEN, data @ ..] if data.len() <= MAX_PDU - 2 => {
+                Response::CanopenGeneralReference { data }
+            }
+            _ => return None,
+        },
+        _ => return None,
+    };
+    Some(Ok(response))
 }
 
 fn counted(function: u8, data: &[u8], expected: usize) -> Result<&[u8], ResponseError> {

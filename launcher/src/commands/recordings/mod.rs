@@ -1,4 +1,8 @@
-//! `dinrail recordings info|cat|recover`.
+//! `dinrail recordings info|cat|recover|export|import`.
+
+pub mod convert;
+mod export;
+mod import;
 
 use super::{DATA_LOSS, println};
 use crate::cli::RecordingsCommand;
@@ -26,6 +30,8 @@ pub fn run(command: RecordingsCommand, json: bool) -> anyhow::Result<ExitCode> {
             print(&file, &filter, if candump { Format::Candump } else { Format::Json })
         }
         RecordingsCommand::Recover { files } => make_whole(&files, json),
+        RecordingsCommand::Export(args) => export::run(&args, json),
+        RecordingsCommand::Import(args) => import::run(&args, json),
     }
 }
 

@@ -1,0 +1,44 @@
+//! A page that is drawn again and again in its place.
+
+use std::io::Write;
+
+/// The terminal's second screen; left when dropped, whatever happens.
+pub struct Page(());
+
+impl Page {
+    pub fn open() -> Self {
+        put("\x1b[?1049h\x1b[?25l\x1b[2J");
+        Self(())
+    }
+
+    /// Shows these lines, as many as there is room for.
+    pub fn draw(&self, lines: &[String]) {
+        let rows = ratatui::crossterm::terminal::size().map_or(24, |(_, rows)| usize::from(rows)).max(2);
+        let mut text = String::from("\x1b[H");
+        let (shown, more) = if lines.len() > rows { (rows - 1, lines.len() - rows + 1) } else { (lines.len(), 0) };
+        for (i, line) in lines[..shown].iter().enumerate() {
+            if i > 0 {
+                text.push_str("\r\n");
+            }
+            text.push_str(line);
+            text.push_str("\x1b[K");
+        }
+        if more > 0 {
+            text += &format!("\r\n... {more} lines more\x1b[K");
+        }
+        text.push_str("\x1b[J");
+        put(&text);
+    }
+}
+
+impl Drop for Page {
+    fn drop(&mut self) {
+        put("\x1b[?25h\x1b[?1049l");
+    }
+}
+
+/// A terminal that is gone is no reason to fail: the command ends with its signal.
+fn put(text: &str) {
+    let mut out = std::io::stdout().lock();
+    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+}

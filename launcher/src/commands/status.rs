@@ -1,0 +1,329 @@
+//! `dinrail status`: how the stack is, and what its services tell about themselves.
+
+use super::ps::{fetch_status, uptime};
+use super::top::feed::{Feed, FeedError, Snapshot, Told};
+use super::{print, table};
+use crate::cli::Which;
+use crate::stackfile::suggestion;
+use crate::supervise::client::{ClientError, find};
+use crate::supervise::control::{ServiceRow, StackStatus};
+use ipc_types::reactor::Reactor;
+use serde_json::{Map, Value, json};
+use std::process::ExitCode;
+use std::time::Duration;
+
+/// Services tell their status once a second; one that does not within this is shown without.
+const STATUS_WAIT: Duration = Duration::from_millis(1500);
+/// Time between two screens of `--watch`.
+const WATCH: Duration = Duration::from_secs(1);
+/// Columns of a table within a status.
+const COLUMNS_MAX: usize = 12;
+/// Rows of it.
+const ROWS_MAX: usize = 64;
+
+/// Which services and how.
+pub struct Wanted<'a> {
+    /// Empty: all.
+    pub services: &'a [String],
+    /// Again every second, until the stack ends or Ctrl-C.
+    pub watch: bool,
+    pub json: bool,
+}
+
+/// Exit code 1 unless the stack is running or starting, and 1 for an unknown service.
+pub fn run(which: &Which, wanted: &Wanted<'_>) -> anyhow::Result<ExitCode> {
+    let stack = find(which.stack.as_deref())?;
+    let mut feed = match Feed::open(&stack) {
+        Ok(feed) => feed,
+        // A stack that is going down has no rail any more, but its launcher still answers.
+        Err(FeedError::Rail(_)) if wanted.services.is_empty() => {
+            let status = fetch_status(which)?;
+            let alone = Snapshot { stack: Some(status), ..Snapshot::default() };
+            print(&shown(&alone, &[], wanted.json));
+            return Ok(code(&alone));
+        }
+        Err(e) => return Err(e.into()),
+    };
+    let services = choose(&feed.services(), wanted.services)?;
+    let mut reactor = Reactor::new()?;
+    let stop = reactor.add(feed.ctx.shutdown_fd())?;
+    let mut first = true;
+    loop {
+        let snapshot = look(&mut feed, &services, first);
+        let snapshot = match snapshot {
+            Ok(snapshot) => snapshot,
+            Err(FeedError::Client(ClientError::Io { .. })) if !first => {
+                eprintln!("dinrail: stack '{}' has ended", stack.stack);
+                return Ok(ExitCode::SUCCESS);
+            }
+            Err(e) => return Err(e.into()),
+        };
+        let text = shown(&snapshot, &services, wanted.json);
+        if !wanted.watch {
+            print(&text);
+            return Ok(code(&snapshot));
+        }
+        print(&frame(&text, first, wanted.json));
+        first = false;
+        if reactor.wait(Some(WATCH))?.contains(&stop) {
+            return Ok(ExitCode::SUCCESS);
+        }
+    }
+}
+
+fn look(feed: &mut Feed, services: &[String], first: bool) -> Result<Snapshot, FeedError> {
+    if first {
+        // Only those that can: a dead service tells nothing.
+        let alive = feed.look()?.rows.into_iter().filter(|r| r.pid != 0 && services.contains(&r.service));
+        let alive: Vec<String> = alive.map(|r| r.service).collect();
+        feed.wait_for_statuses(&alive, STATUS_WAIT);
+    }
+    feed.look()
+}
+
+fn code(snapshot: &Snapshot) -> ExitCode {
+    let well = snapshot.stack.as_ref().is_some_and(|s| matches!(s.state.as_str(), "running" | "starting"));
+    if well { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+}
+
+/// A screen of `--watch`: over the last one on a terminal, else below it.
+fn frame(text: &str, first: bool, json: bool) -> String {
+    use std::io::IsTerminal;
+    if json {
+        return text.to_owned();
+    }
+    if std::io::stdout().is_terminal() {
+        return format!("\x1b[H\x1b[2J{text}");
+    }
+    if first { text.to_owned() } else { format!("\n{text}") }
+}
+
+fn choose(has: &[&str], asked: &[String]) -> anyhow::Result<Vec<String>> {
+    for name in asked {
+        if !has.contains(&name.as_str()) {
+            let help = suggestion(name, "services", has.iter().copied());
+            anyhow::bail!("this stack has no service '{name}'; {help}");
+        }
+    }
+    let wanted = |name: &&&str| asked.is_empty() || asked.iter().any(|a| a == **name);
+    Ok(has.iter().filter(wanted).map(|name| (*name).to_owned()).collect())
+}
+
+fn shown(snapshot: &Snapshot, services: &[String], json: bool) -> String {
+    if json {
+        return format!("{}\n", to_json(snapshot, services));
+    }
+    let mut text = snapshot.stack.as_ref().map(|s| stack_text(s) + "\n").unwrap_or_default();
+    for row in snapshot.rows.iter().filter(|r| services.contains(&r.service)) {
+        let told = snapshot.told.iter().find(|t| t.service == row.service);
+        text += &format!("\n{}", service_text(row, told, snapshot.t_ns));
+    }
+    text
+}
+
+/// The stack's own keys, and `service_list`: the keys of `ps`, `status` (null when it told none) and its age.
+fn to_json(snapshot: &Snapshot, services: &[String]) -> Value {
+    let mut value = snapshot.stack.as_ref().map_or(Value::Null, |s| json!(s));
+    let list: Vec<Value> = snapshot
+        .rows
+        .iter()
+        .filter(|r| services.contains(&r.service))
+        .map(|row| {
+            let told = snapshot.told.iter().find(|t| t.service == row.service);
+            let mut entry = json!(row);
+            entry["status"] = told.map_or(Value::Null, |t| t.body.clone());
+            entry["status_age_ms"] = told.map_or(Value::Null, |t| json!(age_ms(t, snapshot.t_ns)));
+            entry
+        })
+        .collect();
+    if value.is_object() {
+        value["service_list"] = Value::Array(list);
+    }
+    value
+}
+
+fn age_ms(told: &Told, now_ns: u64) -> u64 {
+    now_ns.saturating_sub(told.t_ns) / 1_000_000
+}
+
+pub(super) fn stack_text(s: &StackStatus) -> String {
+    let mut text = format!(
+        "stack '{}' is {}, launcher pid {}, up {}, {} of {} services ready, build {}",
+        s.stack,
+        s.state,
+        s.pid,
+        uptime(s.uptime_ms),
+        s.ready,
+        s.services,
+        s.build_id
+    );
+    if !s.held.is_empty() {
+        // Not "after too many restarts": with `restart = { max = 0 }` there was none.
+        let names = s.held.join(", ");
+        text += &format!(
+            "\nheld, not started again: {names}; `dinrail logs SERVICE` says why, `dinrail restart SERVICE` starts it"
+        );
+    }
+    if let Some(why) = &s.failed {
+        text += &format!("\nfailed: {why}");
+    }
+    text
+}
+
+fn service_text(row: &ServiceRow, told: Option<&Told>, now_ns: u64) -> String {
+    let state = if row.state == "running" { &row.health } else { &row.state };
+    let mut text = format!("{}  {}  {state}", row.service, row.kind);
+    if row.pid != 0 {
+        text += &format!(
+            "  pid {}  up {}  CPU {:.1} %  {:.1} MiB",
+            row.pid,
+            uptime(row.uptime_ms),
+            row.cpu_percent,
+            row.rss_bytes as f64 / 1_048_576.0
+        );
+    }
+    text += &format!("  generation {}  restarts {}\n", row.generation, row.restarts);
+    let Some(told) = told else {
+        let why = if row.pid == 0 { "no process" } else { "it has told no status yet" };
+        return text + &format!("  ({why})\n");
+    };
+    let age_ms = age_ms(told, now_ns);
+    // Twice the period: one that is late by a moment is not worth a line.
+    if age_ms > 2500 {
+        text += &format!("  (told {} ago)\n", uptime(age_ms));
+    }
+    text + &body_text(&told.body)
+}
+
+/// A status, one value a line, lists of objects as tables below.
+fn body_text(body: &Value) -> String {
+    let fields = flat(body);
+    let plain: Vec<(String, String)> = fields
+        .iter()
+        .filter(|(_, value)| rows_of(value).is_none())
+        .map(|(path, value)| (path.clone(), plain(value)))
+        .collect();
+    let width = plain.iter().map(|(path, _)| path.chars().count()).max().unwrap_or(0);
+    let mut text: String =
+        plain.iter().map(|(path, value)| format!("  {path:width$}  {value}").trim_end().to_owned() + "\n").collect();
+    for (path, value) in &fields {
+        if let Some(rows) = rows_of(value) {
+            text += &format!("  {path}\n{}", list_text(&rows));
+        }
+    }
+    text
+}
+
+/// Every value that is no object, by its path: `bus.frames`.
+pub fn flat(value: &Value) -> Vec<(String, &Value)> {
+    fn walk<'a>(prefix: &str, map: &'a Map<String, Value>, depth: u32, out: &mut Vec<(String, &'a Value)>) {
+        for (key, value) in map {
+            let path = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
+            match value {
+                // The depth is bounded by the status's own limit of bytes; this keeps the stack small anyhow.
+                Value::Object(inner) if !inner.is_empty() && depth < 16 => walk(&path, inner, depth + 1, out),
+                _ => out.push((path, value)),
+            }
+        }
+    }
+    let mut out = Vec::new();
+    if let Value::Object(map) = value {
+        walk("", map, 0, &mut out);
+    }
+    out
+}
+
+/// The rows of a list of objects; `None` for anything else.
+fn rows_of(value: &Value) -> Option<Vec<Vec<(String, &Value)>>> {
+    let list = value.as_array().filter(|l| !l.is_empty())?;
+    list.iter().all(Value::is_object).then(|| list.iter().map(flat).collect())
+}
+
+fn list_text(rows: &[Vec<(String, &Value)>]) -> String {
+    let mut head: Vec<&str> = Vec::new();
+    for (path, _) in rows.iter().flatten() {
+        if !head.contains(&path.as_str()) && head.len() < COLUMNS_MAX {
+            head.push(path);
+        }
+    }
+    let cells = |row: &Vec<(String, &Value)>| {
+        let find = |name: &&str| row.iter().find(|(path, _)| path == name).map_or("-".to_owned(), |(_, v)| plain(v));
+        head.iter().map(find).collect::<Vec<String>>()
+    };
+    let body: Vec<Vec<String>> = rows.iter().take(ROWS_MAX).map(cells).collect();
+    let mut text: String = table(&head, &body).lines().map(|line| format!("    {line}\n")).collect();
+    if rows.len() > ROWS_MAX {
+        text += &format!("    and {} more\n", rows.len() - ROWS_MAX);
+    }
+    text
+}
+
+/// A value as people read it, without anything that steers a terminal.
+fn plain(value: &Value) -> String {
+    let text = match value {
+        Value::Null => "-".to_owned(),
+        Value::Bool(true) => "yes".to_owned(),
+        Value::Bool(false) => "no".to_owned(),
+        Value::String(text) => text.clone(),
+        Value::Array(list) if list.is_empty() => "-".to_owned(),
+        Value::Array(list) => list.iter().map(plain).collect::<Vec<_>>().join(", "),
+        Value::Object(map) if map.is_empty() => "-".to_owned(),
+        Value::Number(n) => match n.as_f64().filter(|_| n.is_f64()) {
+            Some(float) => format!("{float:.3}").trim_end_matches('0').trim_end_matches('.').to_owned(),
+            None => n.to_string(),
+        },
+        other @ Value::Object(_) => other.to_string(),
+    };
+    text.chars().map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::commands::top::tests::{row, snapshot};
+
+    #[test]
+    fn every_service_is_shown_with_what_it_tells() {
+        let mut snapshot = snapshot(1);
+        snapshot.told.retain(|t| t.service != "rec");
+        let names: Vec<String> = ["rec", "can1", "plc", "modbus"].map(str::to_owned).into();
+        insta::assert_snapshot!(shown(&snapshot, &names, false));
+        let value: Value = serde_json::from_str(&shown(&snapshot, &names, true)).unwrap();
+        assert_eq!((&value["stack"], value["service_list"].as_array().unwrap().len()), (&json!("demo"), 4));
+        assert_eq!(value["service_list"][1]["status"]["link"]["tec"], 255);
+        assert_eq!((&value["service_list"][0]["status"], &value["service_list"][2]["status_age_ms"]), (&Value::Null, &json!(0)));
+    }
+
+    #[test]
+    fn a_held_service_is_told_without_guessing_why() {
+        let mut stack = snapshot(0).stack.unwrap();
+        stack.held = vec!["io".into()];
+        let text = stack_text(&stack);
+        assert!(text.contains("\nheld, not started again: io; `dinrail logs SERVICE`"), "{text}");
+        assert!(!text.contains("too many"), "{text}");
+    }
+
+    #[test]
+    fn an_unknown_service_is_answered_with_the_nearest() {
+        let has = ["rec", "can0", "modbus"];
+        let refused = choose(&has, &["modus".to_owned()]).unwrap_err().to_string();
+        assert!(refused.starts_with("this stack has no service 'modus'; did you mean 'modbus'?"), "{refused}");
+        let far = choose(&has, &["zzzzzz".to_owned()]).unwrap_err().to_string();
+        assert!(far.contains("rec, can0, modbus"), "{far}");
+        // In the order of the stack, whatever the order asked.
+        assert_eq!(choose(&has, &["modbus".to_owned(), "rec".to_owned()]).unwrap(), ["rec", "modbus"]);
+        assert_eq!(choose(&has, &[]).unwrap().len(), 3);
+    }
+
+    #[test]
+    fn values_are_plain_and_cannot_steer_the_terminal() {
+        let body = json!({ "a": 1.5, "b": 2.0, "c": null, "d": true, "e": [1, 2], "f": [], "g": {}, "h": { "i": "x\u{1b}[2J" } });
+        assert_eq!(
+            body_text(&body),
+            "  a    1.5\n  b    2\n  c    -\n  d    yes\n  e    1, 2\n  f    -\n  g    -\n  h.i  x\u{fffd}[2J\n"
+        );
+        assert_eq!(body_text(&json!("text")), "");
+        let old = Told { service: "a".into(), generation: 1, t_ns: 0, body: json!({}) };
+        assert!(service_text(&row("a", "can"), Some(&old), 5_000_000_000).contains("(told 5 s ago)"));
+    }
+}

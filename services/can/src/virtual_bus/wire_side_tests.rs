@@ -1,0 +1,129 @@
+use super::*;
+use crate::protocol::candump::{format, parse};
+
+const SECOND: u64 = 1_000_000_000;
+
+#[derive(Default)]
+struct Seen(Vec<(String, Origin)>);
+
+impl Tap for Seen {
+    fn frame(&mut self, frame: &Frame, _: u64, origin: Origin) {
+        self.0.push((format(frame), origin));
+    }
+}
+
+/// A bus with a wire that takes three frames at once.
+fn bus(up: bool) -> VirtualBus {
+    let mut bus = VirtualBus::new(Settings {
+        name: "can0".into(),
+        bitrate: 500_000,
+        data_bitrate: 2_000_000,
+        pace: false,
+        max_rate: 1_000_000,
+        tx_queue: 16,
+        client_buffer: 65_536,
+    });
+    bus.attach_wire(3);
+    if up {
+        bus.wire_up(0);
+    }
+    bus
+}
+
+fn push(bus: &mut VirtualBus, text: &str, now_ns: u64) {
+    assert_eq!(bus.push_rail(&parse(text).unwrap(), false, now_ns), Pushed::Queued);
+}
+
+fn next(bus: &mut VirtualBus, now_ns: u64) -> Option<String> {
+    bus.wire_next(now_ns, |f| !f.is_fd()).map(|f| format(&f))
+}
+
+#[test]
+fn three_on_their_way_and_the_rest_in_order_of_arbitration() {
+    let (mut bus, mut seen) = (bus(true), Seen::default());
+    for text in ["300#01", "200#02", "400#03", "500#04"] {
+        push(&mut bus, text, 1);
+    }
+    let given: Vec<_> = std::iter::from_fn(|| next(&mut bus, 2)).collect();
+    assert_eq!(given, ["200#02", "300#01", "400#03"]);
+    assert!(!bus.wire_wants());
+    // A later frame of a lower identifier goes before the one that still waits.
+    push(&mut bus, "001#05", 3);
+    bus.wire_echo(&parse("200#02").unwrap(), 4, &mut seen);
+    assert_eq!(next(&mut bus, 4).as_deref(), Some("001#05"));
+    // Between the echoes stands what others sent: the order of the wire.
+    bus.wire_received(&parse("7FF#").unwrap(), 5, &mut seen);
+    bus.wire_received(&parse("20000080#0000000000000000").unwrap(), 5, &mut seen);
+    bus.wire_echo(&parse("300#01").unwrap(), 6, &mut seen);
+    let seen: Vec<_> = seen.0.iter().map(|(text, origin)| (text.as_str(), *origin)).collect();
+    assert_eq!(
+        seen,
+        [
+            ("200#02", Origin::Rail),
+            ("7FF#", Origin::Wire),
+            ("20000080#0000000000000000", Origin::Wire),
+            ("300#01", Origin::Rail)
+        ]
+    );
+    let counters = bus.wire_counters().unwrap();
+    assert_eq!((counters.sent, counters.received, counters.errors), (2, 1, 1));
+}
+
+#[test]
+fn what_the_wire_cannot_carry_is_dropped_and_counted() {
+    let mut bus = bus(true);
+    push(&mut bus, "123##0AA", 1);
+    push(&mut bus, "124#AA", 1);
+    assert_eq!(next(&mut bus, 2).as_deref(), Some("124#AA"));
+    assert_eq!(bus.wire_counters().unwrap().unfit, 1);
+}
+
+#[test]
+fn frames_wait_for_a_wire_that_is_down_but_not_for_ever() {
+    let mut bus = bus(false);
+    push(&mut bus, "100#01", SECOND);
+    push(&mut bus, "101#02", 5 * SECOND);
+    assert_eq!(next(&mut bus, 6 * SECOND), None);
+    bus.wire_up(6 * SECOND);
+    assert_eq!(next(&mut bus, 6 * SECOND).as_deref(), Some("101#02"));
+    assert_eq!(bus.wire_counters().unwrap().stale, 1);
+    // What was on its way when the wire fell is lost, never sent twice.
+    bus.wire_down();
+    bus.wire_up(7 * SECOND);
+    assert_eq!(next(&mut bus, 7 * SECOND), None);
+    assert_eq!(bus.wire_counters().unwrap().lost, 1);
+}
+
+#[test]
+fn nobody_acknowledges() {
+    let (mut bus, mut seen) = (bus(true), Seen::default());
+    assert_eq!(bus.wire_overdue(SECOND), None);
+    push(&mut bus, "100#01", SECOND);
+    push(&mut bus, "100#02", SECOND);
+    next(&mut bus, SECOND);
+    next(&mut bus, 2 * SECOND);
+    assert_eq!(bus.wire_overdue(9 * SECOND), Some(SECOND));
+    // The kernel dropped something: the echoes may be among it, so they are given up soon.
+    bus.wire_dropped();
+    assert_eq!(bus.wire_overdue(9 * SECOND), None);
+    assert_eq!(bus.wire_counters().unwrap().lost, 2);
+    // One comes after all: it was on the wire and is ours.
+    bus.wire_echo(&parse("100#01").unwrap(), 9 * SECOND, &mut seen);
+    assert_eq!(seen.0, [("100#01".to_owned(), Origin::Rail)]);
+}
+
+#[test]
+fn confirmed_and_refused_in_order() {
+    let (mut bus, mut seen) = (bus(true), Seen::default());
+    for text in ["100#01", "100#02", "100#03"] {
+        push(&mut bus, text, 1);
+        next(&mut bus, 2).unwrap();
+    }
+    bus.wire_sent(3, &mut seen);
+    bus.wire_refused();
+    bus.wire_sent(4, &mut seen);
+    bus.wire_sent(5, &mut seen);
+    bus.wire_refused();
+    assert_eq!(seen.0.iter().map(|(text, _)| text.as_str()).collect::<Vec<_>>(), ["100#01", "100#03"]);
+    assert_eq!(bus.wire_counters().unwrap().lost, 1);
+}

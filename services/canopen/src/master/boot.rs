@@ -1,0 +1,574 @@
+//! The boot-up of one node (CiA 302-2 V4.1, clause 5, "Boot NMT slave"), sans-I/O.
+//!
+//! The machine asks for SDO transfers and NMT commands through [`Action`] and is told how they ended. It never waits
+//! by itself and never gives up for good: a node that failed is tried again, because a plant is repaired while it runs.
+
+use std::fmt;
+
+/// Wait between two tries of a node that does not answer or was refused.
+pub const RETRY_NS: u64 = 1_000_000_000;
+/// Longest wait for the boot-up message after a reset.
+pub const BOOT_UP_NS: u64 = 1_000_000_000;
+/// "load" as 1011h wants it (CiA 301 V4.2, clause 7.5.2.14).
+pub const LOAD_SIGNATURE: [u8; 4] = *b"load";
+
+/// Result of a boot-up that did not end well, by the letters of CiA 302-2.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize)]
+pub enum Letter {
+    /// The node is not in the list of slaves.
+    A,
+    /// No answer to 1000h.
+    B,
+    /// Device type differs.
+    C,
+    /// Vendor differs.
+    D,
+    /// The heartbeat never came.
+    E,
+    /// Node guarding was never answered.
+    F,
+    /// Software objects missing.
+    G,
+    /// Software update not allowed.
+    H,
+    /// Software download failed.
+    I,
+    /// Configuration failed.
+    J,
+    /// Heartbeat lost while error control started.
+    K,
+    /// The node was operational already and was left alone. Not a failure.
+    L,
+    /// Product code differs.
+    M,
+    /// Revision differs.
+    N,
+    /// Serial number differs.
+    O,
+}
+
+impl Letter {
+    /// What it means, as a user is told.
+    pub fn text(self) -> &'static str {
+        match self {
+            Self::A => "the node is not in the list of nodes",
+            Self::B => {
+                "it does not answer to its device type (1000h): is it powered, is the node-id and the bit rate right?"
+            }
+            Self::C => {
+                "its device type (1000h) is another than expected: a different device has this node-id"
+            }
+            Self::D => "its vendor (1018h:01) is another than expected: a different device has this node-id",
+            Self::E => "its heartbeat never came, though 1017h was set",
+            Self::F => "it never answered node guarding: the device or the bus carries no remote frames",
+            Self::G => "it has no objects for its software version",
+            Self::H => "its software differs and an update is not allowed",
+            Self::I => "the download of its software failed",
+            Self::J => "its configuration could not be loaded",
+            Self::K => "its heartbeat was lost while error control started",
+            Self::L => "it was operational already and was left running",
+            Self::M => {
+                "its product code (1018h:02) is another than expected: a different device has this node-id"
+            }
+            Self::N => {
+                "its revision (1018h:03) is another than expected: check the EDS against the device's firmware"
+            }
+            Self::O => "its serial number (1018h:04) is another than expected: the device was exchanged",
+        }
+    }
+}
+
+impl fmt::Display for Letter {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{self:?}")
+    }
+}
+
+/// What a node must be.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Identity {
+    pub device_type: Option<u32>,
+    pub vendor: Option<u32>,
+    pub product: Option<u32>,
+    pub revision: Option<u32>,
+    pub serial: Option<u32>,
+}
+
+/// How a node is watched.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum ErrorControl {
+    #[default]
+    None,
+    /// Its heartbeat must come within this time.
+    Heartbeat { consumer_ns: u64 },
+    /// It is asked by remote frames.
+    Guarding { guard_ns: u64, factor: u8 },
+}
+
+/// An object to write.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Write {
+    pub index: u16,
+    pub sub: u8,
+    pub data: Vec<u8>,
+}
+
+/// How one node is booted.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Plan {
+    pub id: u8,
+    pub identity: Identity,
+    pub keep_alive: bool,
+    /// Sub-index of 1011h.
+    pub restore: Option<u8>,
+    /// Date and time of the configuration (1F26h, 1F27h).
+    pub config_stamp: Option<(u32, u32)>,
+    pub writes: Vec<Write>,
+    pub error_control: ErrorControl,
+    /// Tries of one SDO transfer.
+    pub sdo_tries: u8,
+}
+
+/// How an SDO transfer ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum SdoEnd {
+    Read(Vec<u8>),
+    Written,
+    Abort(u32),
+    Timeout,
+}
+
+/// What the machine asks for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Action {
+    Read {
+        index: u16,
+        sub: u8,
+    },
+    /// Index in [`Plan::writes`], or one of the machine's own.
+    Write(Write),
+    /// NMT: reset communication (CiA 301 clause 7.2.8.3.1.2).
+    ResetCommunication,
+    /// Watch the node from now on; answered by [`Boot::on_alive`] or by time.
+    StartErrorControl,
+    /// The node is ready to be started; `kept` when it has been running all the time.
+    Done {
+        kept: bool,
+    },
+    /// It failed; the machine tries again by itself.
+    Failed(Failure),
+}
+
+/// A try that failed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+pub struct Failure {
+    pub letter: Letter,
+    /// From 1.
+    pub attempt: u32,
+    /// What was expected, for identity letters.
+    pub expected: Option<u32>,
+    /// What the node has.
+    pub got: Option<u32>,
+    /// Object that could not be written.
+    pub object: Option<(u16, u8)>,
+    /// Abort code of the node.
+    pub abort: Option<u32>,
+    /// When, since the try began.
+    pub after_ns: u64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Step {
+    Idle,
+    DeviceType,
+    Vendor,
+    Product,
+    Revision,
+    Serial,
+    /// Waits for a heartbeat or guarding answer that tells the state.
+    State,
+    /// Waits for the boot-up message; then `after`.
+    Reset {
+        restored: bool,
+    },
+    Restore,
+    ConfigDate,
+    ConfigTime,
+    Download(usize),
+    StampDate,
+    StampTime,
+    ErrorControl,
+    Running,
+    /// Failed: tried again at this time.
+    Pause,
+}
+
+/// See the module.
+#[derive(Debug, Clone)]
+pub struct Boot {
+    plan: Plan,
+    step: Step,
+    attempt: u32,
+    /// Tries of the current transfer.
+    tries: u8,
+    began_ns: u64,
+    at_ns: Option<u64>,
+    /// The node's boot-up message was the last news of it: it needs no reset.
+    fresh: bool,
+    /// Last NMT state it told.
+    state: Option<u8>,
+    kept: bool,
+    actions: Vec<Action>,
+}
+
+/// NMT state in a heartbeat (CiA 301 V4.2, clause 7.2.8.3.2.2).
+pub const OPERATIONAL: u8 = 5;
+
+impl Boot {
+    pub fn new(plan: Plan) -> Self {
+        Self {
+            plan,
+            step: Step::Idle,
+            attempt: 0,
+            tries: 0,
+            began_ns: 0,
+            at_ns: None,
+            fresh: false,
+            state: None,
+            kept: false,
+            actions: Vec::with_capacity(4),
+        }
+    }
+
+    pub fn plan(&self) -> &Plan {
+        &self.plan
+    }
+    /// Tries since the node was last running.
+    pub fn attempts(&self) -> u32 {
+        self.attempt
+    }
+    /// Between the first question and the end.
+    pub fn is_busy(&self) -> bool {
+        !matches!(self.step, Step::Idle | Step::Running | Step::Pause)
+    }
+    pub fn is_running(&self) -> bool {
+        self.step == Step::Running
+    }
+    /// Takes the actions asked for since the last call.
+    pub fn drain(&mut self) -> std::vec::Drain<'_, Action> {
+        self.actions.drain(..)
+    }
+    /// When [`Self::on_time`] has something to do.
+    pub fn next_deadline(&self) -> Option<u64> {
+        self.at_ns
+    }
+    /// In words, for the status.
+    pub fn step_text(&self) -> &'static str {
+        match self.step {
+            Step::Idle => "idle",
+            Step::DeviceType => "reading its device type",
+            Step::Vendor | Step::Product | Step::Revision | Step::Serial => "checking its identity",
+            Step::State => "asking for its state",
+            Step::Reset { .. } => "waiting for its boot-up message",
+            Step::Restore => "restoring its defaults",
+            Step::ConfigDate | Step::ConfigTime => "comparing its configuration date",
+            Step::Download(_) | Step::StampDate | Step::StampTime => "loading its configuration",
+            Step::ErrorControl => "starting error control",
+            Step::Running => "booted",
+            Step::Pause => "waiting for the next try",
+        }
+    }
+
+    /// Starts, or starts again.
+    pub fn start(&mut self, now_ns: u64) {
+        self.attempt = self.attempt.saturating_add(1);
+        (self.began_ns, self.at_ns, self.kept) = (now_ns, None, false);
+        self.read(Step::DeviceType);
+    }
+
+    /// Ends everything: the node is not booted by this master any more until [`Self::start`].
+    pub fn stop(&mut self) {
+        (self.step, self.at_ns, self.attempt) = (Step::Idle, None, 0);
+        self.actions.clear();
+    }
+
+    fn read(&mut self, step: Step) {
+        self.tries = 0;
+        self.step = step;
+        self.ask();
+    }
+
+    /// Asks for the transfer of the current step.
+    fn ask(&mut self) {
+        let read = |index, sub| Action::Read { index, sub };
+        let write = |index, sub, data: Vec<u8>| Action::Write(Write { index, sub, data });
+        let stamp = self.plan.config_stamp.unwrap_or((0, 0));
+        let action = match self.step {
+            Step::DeviceType => read(0x1000, 0),
+            Step::Vendor => read(0x1018, 1),
+            Step::Product => read(0x1018, 2),
+            Step::Revision => read(0x1018, 3),
+            Step::Serial => read(0x1018, 4),
+            Step::Restore => write(0x1011, self.plan.restore.unwrap_or(1), LOAD_SIGNATURE.to_vec()),
+            Step::ConfigDate => read(0x1020, 1),
+            Step::ConfigTime => read(0x1020, 2),
+            Step::StampDate => write(0x1020, 1, stamp.0.to_le_bytes().to_vec()),
+            Step::StampTime => write(0x1020, 2, stamp.1.to_le_bytes().to_vec()),
+            Step::Download(i) => match self.plan.writes.get(i) {
+                Some(write) => Action::Write(write.clone()),
+                None => return,
+            },
+            Step::Idle
+            | Step::State
+            | Step::Reset { .. }
+            | Step::ErrorControl
+            | Step::Running
+            | Step::Pause => return,
+        };
+        self.actions.push(action);
+    }
+
+    fn fail(&mut self, now_ns: u64, letter: Letter, detail: impl FnOnce(&mut Failure)) {
+        let mut failure = Failure {
+            letter,
+            attempt: self.attempt,
+            expected: None,
+            got: None,
+            object: None,
+            abort: None,
+            after_ns: now_ns.saturating_sub(self.began_ns),
+        };
+        detail(&mut failure);
+        self.step = Step::Pause;
+        self.fresh = false;
+        self.at_ns = Some(now_ns.saturating_add(RETRY_NS));
+        self.actions.push(Action::Failed(failure));
+    }
+
+    /// The transfer last asked for ended.
+    pub fn on_sdo(&mut self, now_ns: u64, end: &SdoEnd) {
+        if matches!(end, SdoEnd::Timeout) {
+            self.tries += 1;
+            if self.tries < self.plan.sdo_tries.max(1) {
+                return self.ask();
+            }
+        }
+        let abort = match end {
+            SdoEnd::Abort(code) => Some(*code),
+            _ => None,
+        };
+        let value = match end {
+            SdoEnd::Read(data) => {
+                let mut bytes = [0; 4];
+                let n = data.len().min(4);
+                bytes[..n].copy_from_slice(&data[..n]);
+                Some(u32::from_le_bytes(bytes))
+            }
+            _ => None,
+        };
+        let identity = self.plan.identity;
+        match self.step {
+            Step::DeviceType => match value {
+                Some(_) => self.compare(now_ns, Letter::C, identity.device_type, value),
+                None => self.fail(now_ns, Letter::B, |f| f.abort = abort),
+            },
+            Step::Vendor => self.compare(now_ns, Letter::D, identity.vendor, value),
+            Step::Product => self.compare(now_ns, Letter::M, identity.product, value),
+            Step::Revision => self.compare(now_ns, Letter::N, identity.revision, value),
+            Step::Serial => self.compare(now_ns, Letter::O, identity.serial, value),
+            Step::Restore if matches!(end, SdoEnd::Written) => self.reset(now_ns, true),
+            Step::Restore => {
+                let sub = self.plan.restore.unwrap_or(1);
+                self.fail(now_ns, Letter::J, |f| (f.object, f.abort) = (Some((0x1011, sub)), abort));
+            }
+            Step::ConfigDate if value.is_some() && value == self.plan.config_stamp.map(|s| s.0) => {
+                self.read(Step::ConfigTime);
+            }
+            Step::ConfigTime if value.is_some() && value == self.plan.config_stamp.map(|s| s.1) => {
+                self.start_error_control(now_ns);
+            }
+            // Another configuration, or none: it is loaded.
+            Step::ConfigDate | Step::ConfigTime => self.download(now_ns, 0),
+            Step::Download(i) if matches!(end, SdoEnd::Written) => self.download(now_ns, i + 1),
+            Step::Download(i) => {
+                let object = self.plan.writes.get(i).map(|w| (w.index, w.sub));
+                self.fail(now_ns, Letter::J, |f| (f.object, f.abort) = (object, abort));
+            }
+            Step::StampDate if matches!(end, SdoEnd::Written) => self.read(Step::StampTime),
+            Step::StampTime if matches!(end, SdoEnd::Written) => self.start_error_control(now_ns),
+            Step::StampDate | Step::StampTime => {
+                let sub = if self.step == Step::StampDate { 1 } else { 2 };
+                self.fail(now_ns, Letter::J, |f| (f.object, f.abort) = (Some((0x1020, sub)), abort));
+            }
+            Step::Idle
+            | Step::State
+            | Step::Reset { .. }
+            | Step::ErrorControl
+            | Step::Running
+            | Step::Pause => {}
+        }
+    }
+
+    fn compare(&mut self, now_ns: u64, letter: Letter, expected: Option<u32>, got: Option<u32>) {
+        if expected.is_some() && got != expected {
+            return self.fail(now_ns, letter, |f| (f.expected, f.got) = (expected, got));
+        }
+        let identity = self.plan.identity;
+        let order = [
+            (Step::Vendor, identity.vendor),
+            (Step::Product, identity.product),
+            (Step::Revision, identity.revision),
+            (Step::Serial, identity.serial),
+        ];
+        let done = order.iter().position(|(step, _)| *step == self.step).map_or(0, |i| i + 1);
+        if let Some((step, _)) = order[done..].iter().find(|(_, expected)| expected.is_some()) {
+            return self.read(*step);
+        }
+        self.identified(now_ns);
+    }
+
+    /// It is the right device: leave it running, or begin from its reset.
+    fn identified(&mut self, now_ns: u64) {
+        if !self.plan.keep_alive {
+            return self.reset_or_go_on(now_ns);
+        }
+        match self.state {
+            Some(OPERATIONAL) => self.keep(now_ns),
+            Some(_) => self.reset_or_go_on(now_ns),
+            None => {
+                // Its heartbeat tells, or the answer to a guarding request.
+                self.step = Step::State;
+                let wait_ns = match self.plan.error_control {
+                    ErrorControl::Heartbeat { consumer_ns } => consumer_ns,
+                    ErrorControl::Guarding { guard_ns, .. } => guard_ns.saturating_mul(2),
+                    ErrorControl::None => 0,
+                };
+                self.at_ns = Some(now_ns.saturating_add(wait_ns));
+                if !matches!(self.plan.error_control, ErrorControl::None) {
+                    self.actions.push(Action::StartErrorControl);
+                }
+            }
+        }
+    }
+
+    fn keep(&mut self, now_ns: u64) {
+        self.kept = true;
+        self.start_error_control(now_ns);
+    }
+
+    fn reset_or_go_on(&mut self, now_ns: u64) {
+        if self.fresh { self.restore_or_configure(now_ns, false) } else { self.reset(now_ns, false) }
+    }
+
+    fn reset(&mut self, now_ns: u64, restored: bool) {
+        self.fresh = false;
+        self.step = Step::Reset { restored };
+        self.at_ns = Some(now_ns.saturating_add(BOOT_UP_NS));
+        self.actions.push(Action::ResetCommunication);
+    }
+
+    fn restore_or_configure(&mut self, now_ns: u64, restored: bool) {
+        self.at_ns = None;
+        if self.plan.restore.is_some() && !restored {
+            return self.read(Step::Restore);
+        }
+        if self.plan.config_stamp.is_some() && !restored {
+            return self.read(Step::ConfigDate);
+        }
+        self.download(now_ns, 0);
+    }
+
+    fn download(&mut self, now_ns: u64, next: usize) {
+        if next < self.plan.writes.len() {
+            self.read(Step::Download(next));
+        } else if self.plan.config_stamp.is_some() {
+            self.read(Step::StampDate);
+        } else {
+            self.start_error_control(now_ns);
+        }
+    }
+
+    fn start_error_control(&mut self, now_ns: u64) {
+        let wait_ns = match self.plan.error_control {
+            ErrorControl::None => return self.done(),
+            ErrorControl::Heartbeat { consumer_ns } => consumer_ns,
+            ErrorControl::Guarding { guard_ns, factor } => guard_ns.saturating_mul(u64::from(factor.max(1))),
+        };
+        self.step = Step::ErrorControl;
+        self.at_ns = Some(now_ns.saturating_add(wait_ns));
+        self.actions.push(Action::StartErrorControl);
+    }
+
+    fn done(&mut self) {
+        self.step = Step::Running;
+        (self.at_ns, self.fresh) = (None, false);
+        self.attempt = 0;
+        self.actions.push(Action::Done { kept: self.kept });
+    }
+
+    /// The node sent its boot-up message.
+    pub fn on_boot_up(&mut self, now_ns: u64) {
+        self.fresh = true;
+        self.state = Some(127);
+        match self.step {
+            Step::Reset { restored } => self.restore_or_configure(now_ns, restored),
+            // It was reset by somebody while it was configured or ran: begin again.
+            Step::Idle => {}
+            _ => {
+                self.actions.clear();
+                self.start(now_ns);
+            }
+        }
+    }
+
+    /// Its heartbeat or guarding answer told this state.
+    pub fn on_alive(&mut self, now_ns: u64, state: u8) {
+        self.state = Some(state);
+        match self.step {
+            Step::State if state == OPERATIONAL => self.keep(now_ns),
+            Step::State => self.reset_or_go_on(now_ns),
+            Step::ErrorControl => self.done(),
+            // It was there before its pause was over.
+            Step::Pause if self.attempt > 0 => {}
+            _ => {}
+        }
+    }
+
+    /// Error control found the node missing.
+    pub fn on_lost(&mut self, now_ns: u64) {
+        self.state = None;
+        self.fresh = false;
+        match self.step {
+            Step::ErrorControl => self.fail(now_ns, Letter::K, |_| {}),
+            Step::Running => {
+                self.step = Step::Pause;
+                self.at_ns = Some(now_ns.saturating_add(RETRY_NS));
+            }
+            _ => {}
+        }
+    }
+
+    pub fn on_time(&mut self, now_ns: u64) {
+        if self.at_ns.is_none_or(|at_ns| now_ns < at_ns) {
+            return;
+        }
+        self.at_ns = None;
+        match self.step {
+            Step::State => self.reset_or_go_on(now_ns),
+            Step::Reset { .. } => self.fail(now_ns, Letter::B, |_| {}),
+            Step::ErrorControl => {
+                let letter = match self.plan.error_control {
+                    ErrorControl::Guarding { .. } => Letter::F,
+                    ErrorControl::Heartbeat { .. } | ErrorControl::None => Letter::E,
+                };
+                self.fail(now_ns, letter, |_| {});
+            }
+            Step::Pause => self.start(now_ns),
+            _ => {}
+        }
+    }
+}
+
+#[cfg(test)]
+#[path = "boot_tests.rs"]
+mod tests;

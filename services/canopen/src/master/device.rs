@@ -1,0 +1,95 @@
+//! What is known of a node's device before it answers: its EDS or DCF.
+
+use crate::config::ObjectRef;
+use crate::protocol::od::ObjectDictionary;
+
+/// An object that a name could mean.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Named {
+    pub index: u16,
+    pub sub: u8,
+    /// As in the EDS; of a sub-object: `object, sub-object`.
+    pub name: String,
+}
+
+/// A device description, resolved for a node-id.
+#[derive(Debug, Clone)]
+pub struct Device {
+    /// Product name.
+    pub name: String,
+    pub od: ObjectDictionary,
+    /// In order of index and sub-index.
+    pub names: Vec<Named>,
+    /// Objects whose value the DCF sets: index, sub-index, value.
+    pub values: Vec<(u16, u8, Vec<u8>)>,
+}
+
+impl Device {
+    /// Name of an object, for output.
+    pub fn name_of(&self, index: u16, sub: u8) -> Option<&str> {
+        let at = self.names.binary_search_by_key(&(index, sub), |n| (n.index, n.sub)).ok()?;
+        Some(&self.names[at].name)
+    }
+
+    /// The object meant; an error lists the nearest.
+    pub fn resolve(&self, object: &ObjectRef) -> Result<(u16, u8), String> {
+        match object {
+            ObjectRef::Number { index, sub, .. } => {
+                if self.od.find(*index, *sub).is_ok() {
+                    return Ok((*index, *sub));
+                }
+                let subs: Vec<String> = self
+                    .od
+                    .entries_of(*index)
+                    .map(|(_, e)| format!("{:04X}:{:02X}", e.index, e.sub))
+                    .collect();
+                let near = if subs.is_empty() { self.nearest(*index) } else { subs };
+                Err(format!("the EDS has no object {object}; it has {}", near.join(", ")))
+            }
+            ObjectRef::Name(name) => {
+                let same = |n: &&Named| {
+                    n.name.eq_ignore_ascii_case(name)
+                        || n.name.split_once(", ").is_some_and(|(_, sub)| sub.eq_ignore_ascii_case(name))
+                };
+                let mut found = self.names.iter().filter(same);
+                match (found.next(), found.next()) {
+                    (Some(one), None) => Ok((one.index, one.sub)),
+                    (Some(one), Some(two)) => Err(format!(
+                        "'{name}' names several objects of the EDS, {:04X}:{:02X} and {:04X}:{:02X}; write the number",
+                        one.index, one.sub, two.index, two.sub
+                    )),
+                    (None, _) => Err(self.no_such_name(name)),
+                }
+            }
+        }
+    }
+
+    /// Up to three objects beside an index.
+    fn nearest(&self, index: u16) -> Vec<String> {
+        let mut all: Vec<u16> = self.od.objects().iter().map(|o| o.index).collect();
+        all.sort_by_key(|&i| i.abs_diff(index));
+        all.truncate(3);
+        all.sort_unstable();
+        all.iter().map(|i| format!("{i:04X}")).collect()
+    }
+
+    fn no_such_name(&self, name: &str) -> String {
+        let wanted = name.to_ascii_lowercase();
+        let like = |n: &&Named| {
+            let own = n.name.to_ascii_lowercase();
+            wanted.split_whitespace().any(|word| word.len() > 2 && own.contains(word))
+        };
+        let near: Vec<String> = self
+            .names
+            .iter()
+            .filter(like)
+            .take(3)
+            .map(|n| format!("'{}' ({:04X}:{:02X})", n.name, n.index, n.sub))
+            .collect();
+        if near.is_empty() {
+            format!("the EDS has no object named '{name}'; write its number, like \"6000:01\"")
+        } else {
+            format!("the EDS has no object named '{name}'; near to it are {}", near.join(", "))
+        }
+    }
+}

@@ -1,0 +1,131 @@
+use super::*;
+use crate::master::testing::device;
+use serde_json::json;
+
+fn planned(table: serde_json::Value) -> Plan {
+    let config: Config = serde_json::from_value(table).unwrap();
+    let devices: BTreeMap<_, _> = config.nodes.iter().map(|n| (n.id, device(n.id))).collect();
+    plan(&config, &devices, Addressing::Element, "io")
+}
+
+fn mistakes(table: serde_json::Value) -> String {
+    let said = planned(table).mistakes;
+    said.iter()
+        .map(|m| format!("{}{}: {}; {}\n", if m.warning { "warning " } else { "" }, m.key, m.message, m.help))
+        .collect()
+}
+
+fn writes(plan: &Plan) -> String {
+    let text = |w: &Write| {
+        let value = w.data.iter().rev().map(|b| format!("{b:02X}")).collect::<String>();
+        format!("{:04X}:{:02X} = {value}\n", w.index, w.sub)
+    };
+    plan.nodes[0].settings.plan.writes.iter().map(text).collect()
+}
+
+#[test]
+fn a_mapped_object_takes_the_pdo_that_has_it() {
+    let plan = planned(json!({ "node": [{ "id": 5, "eds": "x", "map": [
+        { "object": "Inputs 9-16", "to": "%IB1" },
+        { "object": "6200:01", "from": "%QB0", "symbol": "Lamps" },
+    ] }] }));
+    assert_eq!(plan.mistakes, []);
+    let [rx] = &plan.exchange.rx[..] else { panic!() };
+    assert_eq!((rx.cob_id, rx.length, rx.fields[0].pdo_bit, rx.fields[0].bits), (0x185, 2, 8, 8));
+    let [tx] = &plan.exchange.tx[..] else { panic!() };
+    assert_eq!((tx.cob_id, tx.length, tx.transmission), (0x205, 2, 255));
+    assert_eq!(plan.inputs[0].label, "node 5 6000:02 Digital inputs, Inputs 9-16, TPDO 1");
+    assert_eq!(
+        (plan.outputs[0].symbol.as_deref(), plan.outputs[0].type_name.as_deref()),
+        (Some("Lamps"), Some("USINT"))
+    );
+    insta::assert_snapshot!(writes(&plan), @r"
+    1800:01 = 80000185
+    1800:02 = FF
+    1800:03 = 0000
+    1800:05 = 0000
+    1800:01 = 00000185
+    1400:01 = 80000205
+    1400:02 = FF
+    1400:05 = 0000
+    1400:01 = 00000205
+    ");
+}
+
+#[test]
+fn other_objects_get_the_first_free_pdo_in_lock_step() {
+    let plan = planned(json!({ "sync_period": "10ms", "node": [{ "id": 5, "eds": "x", "map": [
+        { "object": "6401:01", "to": "%IW8" },
+    ] }] }));
+    assert_eq!(plan.mistakes, []);
+    assert_eq!((plan.exchange.rx[0].cob_id, plan.exchange.rx[0].transmission), (0x285, 1));
+    assert!(plan.exchange.rx[0].fields[0].signed);
+    insta::assert_snapshot!(writes(&plan), @r"
+    1801:01 = 80000285
+    1A01:00 = 00
+    1A01:01 = 64010110
+    1A01:00 = 01
+    1801:02 = 01
+    1801:03 = 0000
+    1801:05 = 0000
+    1801:06 = 00
+    1801:01 = 00000285
+    ");
+}
+
+#[test]
+fn what_the_stack_file_sets_of_a_pdo_is_written() {
+    let plan = planned(json!({ "node": [{ "id": 5, "eds": "x",
+        "sdo": [{ "object": "2000", "value": "$NODEID+0x100" }], "heartbeat": "100ms",
+        "tpdo": [{ "number": 1, "cob_id": "$NODEID+0x380", "transmission": 3, "inhibit_time": "5ms", "event_timer": "1s",
+                   "mapping": ["6000:01", "6401:01"] }],
+        "rpdo": [{ "number": 1, "enabled": false }],
+        "map": [{ "object": "6401:01", "to": "%IW8" }],
+    }] }));
+    insta::assert_snapshot!(writes(&plan), @r"
+    2000:00 = 00000105
+    1017:00 = 0064
+    1016:01 = 000105DC
+    1800:01 = 80000385
+    1A00:00 = 00
+    1A00:01 = 60000108
+    1A00:02 = 64010110
+    1A00:00 = 02
+    1800:02 = 03
+    1800:03 = 0032
+    1800:05 = 03E8
+    1800:06 = 00
+    1800:01 = 00000385
+    1400:01 = 80000205
+    ");
+    assert_eq!(plan.exchange.rx[0].fields[0].pdo_bit, 8);
+}
+
+#[test]
+fn mistakes_are_named() {
+    let node = |map: serde_json::Value| json!({ "node": [{ "id": 5, "eds": "x", "map": [map] }] });
+    let said: String = [
+        node(json!({ "object": "6000:09", "to": "%IB0" })),
+        node(json!({ "object": "6100:01", "to": "%IB0" })),
+        node(json!({ "object": "Digital thing", "to": "%IB0" })),
+        node(json!({ "object": "1017", "to": "%IW0" })),
+        node(json!({ "object": "6000:01", "from": "%QB0" })),
+        node(json!({ "object": "6000:01", "to": "%QB0" })),
+        node(json!({ "object": "6401:01", "to": "%IB0" })),
+        node(json!({ "object": "6000:01", "to": "%IB0", "from": "%QB0" })),
+        node(json!({ "object": "6000:01", "to": "IB0" })),
+        json!({ "node": [{ "id": 1 }, { "id": 5 }, { "id": 5 }, { "id": 200 }] }),
+        json!({ "sync_overflow": 1, "sync_period": "100us", "node": [{ "id": 5 }] }),
+        json!({ "node": [{ "id": 5, "rpdo": [{ "number": 9 }], "tpdo": [
+            { "number": 1, "transmission": 250, "cob_id": "0x601",
+              "mapping": ["6000:01", "6000:02", "6401:01", "6401:01", "6401:01", "6401:01"] }] }] }),
+        json!({ "node": [{ "id": 5 }, { "id": 6, "tpdo": [{ "number": 1, "cob_id": "0x185" }] }] }),
+        json!({ "node": [{ "id": 5, "tpdo": [{ "number": 1, "transmission": 1 }] }] }),
+        json!({ "node": [{ "id": 5, "sdo": [{ "object": "1017", "value": 70000 }, { "object": "1000", "value": 1 },
+            { "object": "1016:01", "value": "0x10064" }] }] }),
+    ]
+    .into_iter()
+    .map(mistakes)
+    .collect();
+    insta::assert_snapshot!(said);
+}

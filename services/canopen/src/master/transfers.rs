@@ -1,0 +1,233 @@
+//! SDO transfers of the master: one at a time and node, the others wait in their node's queue. Sans-I/O.
+
+use super::boot::SdoEnd;
+use crate::protocol::abort::Abort;
+use crate::protocol::io::Outbox;
+use crate::protocol::sdo::{Channel, ClientConfig, Direction, Failure, Finished, Options, SdoClient};
+use ipc_types::payload::CanFrame;
+use std::collections::VecDeque;
+
+/// Transfers that wait for one node; more are refused.
+pub const MAX_QUEUE: usize = 32;
+/// Ends that nobody took yet; the oldest is dropped, because who asked is gone.
+const MAX_ENDS: usize = 256;
+
+/// Who asked for a transfer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Owner {
+    /// The boot-up of the node; it goes before jobs.
+    Boot,
+    /// A job, by the number its caller gave.
+    Job(u64),
+}
+
+/// A transfer of a job.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Request {
+    pub index: u16,
+    pub sub: u8,
+    /// Data to write; `None` reads.
+    pub data: Option<Vec<u8>>,
+    pub owner: Owner,
+    pub options: Options,
+}
+
+/// How a job's transfer ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct JobEnd {
+    pub job: u64,
+    pub node: u8,
+    pub index: u16,
+    pub sub: u8,
+    pub direction: Direction,
+    /// Data read, empty after a write.
+    pub result: Result<Vec<u8>, Failure>,
+}
+
+#[derive(Debug)]
+struct Slot {
+    node: u8,
+    client: SdoClient,
+    queue: VecDeque<Request>,
+    current: Option<Owner>,
+}
+
+/// See the module.
+#[derive(Debug)]
+pub struct Transfers {
+    slots: Vec<Slot>,
+    place: [u8; 128],
+    boot_ends: VecDeque<(u8, SdoEnd)>,
+    job_ends: VecDeque<JobEnd>,
+    /// Transfers that were refused because their node's queue was full.
+    pub refused: u64,
+}
+
+const NOWHERE: u8 = u8::MAX;
+
+impl Transfers {
+    /// One client a node: node-id and its time-out.
+    pub fn new(nodes: impl IntoIterator<Item = (u8, u64)>) -> Self {
+        let mut all = Self {
+            slots: Vec::new(),
+            place: [NOWHERE; 128],
+            boot_ends: VecDeque::with_capacity(MAX_ENDS),
+            job_ends: VecDeque::with_capacity(MAX_ENDS),
+            refused: 0,
+        };
+        for (node, timeout_ns) in nodes {
+            all.add(node, timeout_ns);
+        }
+        all
+    }
+
+    /// Adds a node that is not there yet: jobs may talk to nodes that no stack file names.
+    pub fn add(&mut self, node: u8, timeout_ns: u64) {
+        let id = usize::from(node);
+        if !(1..128).contains(&id) || self.place[id] != NOWHERE {
+            return;
+        }
+        self.place[id] = self.slots.len() as u8;
+        let config = ClientConfig { timeout_ns, ..ClientConfig::default() };
+        let client = SdoClient::new(Channel::default_of(node), config);
+        self.slots.push(Slot { node, client, queue: VecDeque::with_capacity(MAX_QUEUE), current: None });
+    }
+
+    fn slot(&mut self, node: u8) -> Option<&mut Slot> {
+        let at = *self.place.get(usize::from(node))?;
+        self.slots.get_mut(usize::from(at))
+    }
+
+    pub fn read(&mut self, now_ns: u64, node: u8, index: u16, sub: u8, owner: Owner, out: &mut Outbox) {
+        let request = Request { index, sub, data: None, owner, options: Options::default() };
+        self.ask(now_ns, node, request, out);
+    }
+
+    #[expect(clippy::too_many_arguments, reason = "object, value and who asks")]
+    pub fn write(
+        &mut self,
+        now_ns: u64,
+        node: u8,
+        index: u16,
+        sub: u8,
+        data: Vec<u8>,
+        owner: Owner,
+        out: &mut Outbox,
+    ) {
+        let request = Request { index, sub, data: Some(data), owner, options: Options::default() };
+        self.ask(now_ns, node, request, out);
+    }
+
+    /// Queues a transfer; false when the node's queue is full or the node is not known.
+    pub fn ask(&mut self, now_ns: u64, node: u8, request: Request, out: &mut Outbox) -> bool {
+        let Some(slot) = self.slot(node) else { return false };
+        if slot.queue.len() >= MAX_QUEUE && request.owner != Owner::Boot {
+            self.refused += 1;
+            return false;
+        }
+        if request.owner == Owner::Boot {
+            slot.queue.push_front(request);
+        } else {
+            slot.queue.push_back(request);
+        }
+        self.next(now_ns, node, out);
+        true
+    }
+
+    /// Gives up what an owner asked of a node, without telling it.
+    pub fn cancel(&mut self, node: u8, owner: Owner) {
+        let Some(slot) = self.slot(node) else { return };
+        slot.queue.retain(|r| r.owner != owner);
+        if slot.current == Some(owner) {
+            slot.client.reset();
+            slot.current = None;
+        }
+        if owner == Owner::Boot {
+            self.boot_ends.retain(|(of, _)| *of != node);
+        }
+    }
+
+    /// Starts the next transfer of an idle node.
+    fn next(&mut self, now_ns: u64, node: u8, out: &mut Outbox) {
+        let Some(slot) = self.slot(node) else { return };
+        if slot.current.is_some() {
+            return;
+        }
+        let Some(request) = slot.queue.pop_front() else { return };
+        slot.current = Some(request.owner);
+        let Request { index, sub, data, options, .. } = request;
+        let (direction, started) = match data {
+            Some(data) => {
+                (Direction::Write, slot.client.start_write(now_ns, index, sub, &data, options, out))
+            }
+            None => (Direction::Read, slot.client.start_read(now_ns, index, sub, options, out)),
+        };
+        if started.is_err() {
+            let failure = Failure { abort: Abort::MEMORY, by: crate::protocol::sdo::By::Client };
+            self.ended(now_ns, node, Finished { index, sub, direction, result: Err(failure) }, out);
+        }
+    }
+
+    fn ended(&mut self, now_ns: u64, node: u8, finished: Finished, out: &mut Outbox) {
+        let Some(slot) = self.slot(node) else { return };
+        let owner = slot.current.take();
+        let Finished { index, sub, direction, result } = finished;
+        let result = result.map(|n| match direction {
+            Direction::Read => slot.client.data().get(..n).unwrap_or_default().to_vec(),
+            Direction::Write => Vec::new(),
+        });
+        match owner {
+            Some(Owner::Boot) => {
+                let end = match result {
+                    Ok(data) if direction == Direction::Read => SdoEnd::Read(data),
+                    Ok(_) => SdoEnd::Written,
+                    Err(failure) if failure.is_timeout() => SdoEnd::Timeout,
+                    Err(failure) => SdoEnd::Abort(failure.abort.0),
+                };
+                self.boot_ends.push_back((node, end));
+            }
+            Some(Owner::Job(job)) => {
+                if self.job_ends.len() == MAX_ENDS {
+                    self.job_ends.pop_front();
+                }
+                self.job_ends.push_back(JobEnd { job, node, index, sub, direction, result });
+            }
+            None => {}
+        }
+        self.next(now_ns, node, out);
+    }
+
+    /// A frame of a node's SDO server, 580h + node-id.
+    pub fn on_frame(&mut self, t_ns: u64, node: u8, frame: &CanFrame, out: &mut Outbox) {
+        let Some(slot) = self.slot(node) else { return };
+        if let Some(finished) = slot.client.on_frame(t_ns, frame, out) {
+            self.ended(t_ns, node, finished, out);
+        }
+    }
+
+    pub fn on_time(&mut self, now_ns: u64, out: &mut Outbox) {
+        for i in 0..self.slots.len() {
+            let slot = &mut self.slots[i];
+            if slot.current.is_none() {
+                continue;
+            }
+            let node = slot.node;
+            if let Some(finished) = slot.client.on_time(now_ns, out) {
+                self.ended(now_ns, node, finished, out);
+            }
+        }
+    }
+
+    pub fn next_deadline(&self) -> Option<u64> {
+        self.slots.iter().filter(|s| s.current.is_some()).filter_map(|s| s.client.next_deadline()).min()
+    }
+
+    /// The next transfer of a boot-up that ended.
+    pub fn take_boot_end(&mut self) -> Option<(u8, SdoEnd)> {
+        self.boot_ends.pop_front()
+    }
+    /// The next transfer of a job that ended.
+    pub fn take_job_end(&mut self) -> Option<JobEnd> {
+        self.job_ends.pop_front()
+    }
+}

@@ -1,0 +1,17 @@
+//! The master: units on lines are polled into %I, follow %Q and %M, and answer jobs of anybody.
+//!
+//! Three storeys: [`config`] and [`plan`] resolve the stack file; [`line`] schedules one line, [`image`] turns
+//! answers into inputs and outputs into requests, [`ask`] jobs into requests, all in virtual time and without I/O;
+//! [`service`] is the process with its transports.
+//!
+//! What may never happen here: two requests in flight on a line, a job without an end, an answer to one request
+//! taken for that to another, an output written from an image that is too old to be true.
+
+pub mod ask;
+pub mod config;
+pub mod image;
+pub mod line;
+pub mod order;
+pub mod plan;
+
+pub use config::Config;

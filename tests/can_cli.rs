@@ -1,0 +1,341 @@
+//! The CAN command line on a running stack, and CAN logs from and to the formats of others, with python-can as the judge.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+mod support;
+
+use serde_json::Value;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Stdio};
+use support::{Scratch, Stack, cases, dinrail, peers};
+
+const STACK: &str = r#"
+[stack]
+name = "NAME"
+
+[[service]]
+name = "rec"
+kind = "recorder"
+dir = "recordings"
+
+[[service]]
+name = "can0"
+kind = "can"
+backend = "virtual"
+bitrate = "1M"
+
+[[service]]
+name = "can1"
+kind = "can"
+backend = "virtual"
+bitrate = "1M"
+"#;
+
+/// A `can dump` whose lines go to a file, seen to be listening.
+struct Dump {
+    child: Child,
+    path: PathBuf,
+    bus: String,
+}
+
+impl Dump {
+    fn start(stack: &Stack, bus: &str, name: &str) -> Self {
+        let path = stack.scratch.0.join(name);
+        let child = dinrail()
+            .args(["can", "dump", bus, "--stack", &stack.name])
+            .stdout(fs::File::create(&path).unwrap())
+            .stderr(fs::File::create(path.with_extension("err")).unwrap())
+            .spawn()
+            .unwrap();
+        let dump = Self { child, path, bus: bus.to_owned() };
+        stack.wait("the dump listens", || {
+            stack.ok(&["can", "send", bus, "7F0#AA"]);
+            (!dump.text().is_empty()).then_some(())
+        });
+        dump
+    }
+
+    fn text(&self) -> String {
+        fs::read_to_string(&self.path).unwrap_or_default()
+    }
+
+    /// The frames between the first frame and now, as `ID#DATA`.
+    fn end(mut self, stack: &Stack) -> Vec<String> {
+        stack.ok(&["can", "send", &self.bus, "7F1#BB"]);
+        stack.wait("the dump saw everything", || self.text().contains("7F1#BB\n").then_some(()));
+        let pid = rustix::process::Pid::from_child(&self.child);
+        rustix::process::kill_process(pid, rustix::process::Signal::INT).unwrap();
+        let status = self.child.wait().unwrap();
+        let said = fs::read_to_string(self.path.with_extension("err")).unwrap();
+        assert_eq!((status.code(), said.as_str()), (Some(0), ""));
+        let frames = frames(&self.text());
+        frames.into_iter().filter(|f| f != "7F0#AA" && f != "7F1#BB").collect()
+    }
+}
+
+/// Third column of candump lines.
+fn frames(log: &str) -> Vec<String> {
+    log.lines().map(|line| line.split_whitespace().nth(2).unwrap().to_owned()).collect()
+}
+
+/// A command without a stack that must succeed.
+fn ok(args: &[&str]) -> String {
+    let output = dinrail().args(args).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "dinrail {args:?}: {:?} {said}", output.status);
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// Exit code and what a command said on stderr.
+fn refused(args: &[&str]) -> (i32, String) {
+    let output = dinrail().args(args).output().unwrap();
+    (output.status.code().unwrap(), String::from_utf8_lossy(&output.stderr).into_owned())
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+#[test]
+fn generated_frames_are_dumped_recorded_and_replayed_in_their_order() {
+    let mut stack = Stack::up("cancli", STACK, &[]);
+    let dump = Dump::start(&stack, "can0", "gen.log");
+    let gen_args = ["can", "gen", "can0", "--mix", "--fd", "--gap", "0", "--count", "5000", "--seed", "42", "--in-order", "--json"];
+    let summary: Value = serde_json::from_str(&stack.ok(&gen_args)).unwrap();
+    assert_eq!((&summary["sent"], &summary["echoed"]), (&5000.into(), &5000.into()), "{summary}");
+    assert_eq!(summary["out_of_order"], 0, "{summary}");
+    let generated = dump.end(&stack);
+    assert_eq!(generated.len(), 5000);
+    // The same seed on the other bus: the same frames, whatever the order.
+    let dump = Dump::start(&stack, "can1", "again.log");
+    stack.ok(&["can", "gen", "can1", "--mix", "--fd", "--gap", "0", "--count", "5000", "--seed", "42"]);
+    let (mut again, mut sorted) = (dump.end(&stack), generated.clone());
+    again.sort();
+    sorted.sort();
+    assert_eq!(again, sorted);
+
+    // The log, the same as MCAP, and the stack's own recording: each replayed on the other bus.
+    let log = stack.scratch.0.join("gen.log");
+    let imported = stack.scratch.0.join("imported.mcap");
+    ok(&["recordings", "import", text(&log), "-o", text(&imported), "--bus", "can0"]);
+    for file in [&log, &imported] {
+        let dump = Dump::start(&stack, "can1", "replayed.log");
+        let args = ["can", "replay", text(file), "--bus", "can1", "--no-wait", "--filter", "!7F0", "--filter", "!7F1"];
+        let said = stack.ok(&args);
+        assert!(said.contains("frames sent") && said.contains("every one was seen on the bus, in order"), "{said}");
+        let replayed = dump.end(&stack);
+        let kept = |frames: &[String]| -> Vec<String> {
+            frames.iter().filter(|f| !f.starts_with("7F0#") && !f.starts_with("7F1#")).cloned().collect()
+        };
+        assert!(kept(&replayed) == kept(&generated), "{}: another order or other frames", file.display());
+    }
+    assert_eq!(stack.take_down(), 0);
+    let recording = &stack.recordings()[0];
+    let exported = frames(&ok(&["recordings", "export", text(recording), "--bus", "can0"]));
+    let own: Vec<String> = exported.into_iter().filter(|f| f != "7F0#AA" && f != "7F1#BB").collect();
+    assert!(own == generated, "the recording holds other frames than the dump");
+    let asc = stack.scratch.0.join("all.asc");
+    ok(&["recordings", "export", text(recording), "-o", text(&asc)]);
+    assert!(fs::read_to_string(&asc).unwrap().contains("// channel 2 is can1\n"));
+}
+
+#[test]
+fn the_car_log_is_replayed_bit_for_bit() {
+    let Some(cases) = cases() else { return };
+    let log = cases.join("canlogs/savvycan/examples_candump.log");
+    let mut stack = Stack::up("carlog", STACK, &[]);
+    let dump = Dump::start(&stack, "can1", "car.log");
+    let said = stack.ok(&["can", "replay", text(&log), "--map", "vcan0=can1", "--no-wait", "--json"]);
+    let said: Value = serde_json::from_str(&said).unwrap();
+    assert_eq!((&said["whole"], &said["buses"]["can1"]["out_of_order"]), (&true.into(), &0.into()), "{said}");
+    let expected = frames(&fs::read_to_string(&log).unwrap());
+    let got = dump.end(&stack);
+    assert_eq!(got.len(), expected.len());
+    assert!(got == expected, "another order or other frames");
+    // With its own timing, a part of it, fast.
+    let begin = std::time::Instant::now();
+    let args = ["can", "replay", text(&log), "--bus", "can0", "--from", "1s", "--to", "3s", "--speed", "2", "--json"];
+    let said: Value = serde_json::from_str(&stack.ok(&args)).unwrap();
+    assert!(begin.elapsed().as_millis() >= 900, "faster than asked for: {said}");
+    assert_eq!(said["whole"], true, "{said}");
+    assert!(said["buses"]["can0"]["sent"].as_u64().unwrap() > 0, "{said}");
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn several_buses_filters_statistics_and_changes() {
+    let mut stack = Stack::up("buses", STACK, &[]);
+    let spawn = |args: &[&str]| {
+        dinrail().args(args).args(["--stack", &stack.name]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+    };
+    let dump = spawn(&["can", "dump", "all", "--filter", "100-1FF,!1A0", "--for", "4s", "--json"]);
+    let sniff = spawn(&["can", "sniff", "can0", "--for", "4s"]);
+    let stats = spawn(&["can", "stats", "--for", "4s", "--json"]);
+    stack.wait("a second of frames", || {
+        for (bus, frame) in [("can0", "1B0#01"), ("can1", "1C0#02"), ("can0", "1A0#03"), ("can1", "200#04")] {
+            stack.ok(&["can", "send", bus, frame]);
+        }
+        stack.ok(&["can", "send", "can0", "1B0#FF", "--count", "3", "--every", "1ms"]);
+        Some(())
+    });
+    std::thread::sleep(std::time::Duration::from_secs(1));
+    for _ in 0..20 {
+        for (bus, frame) in [("can0", "1B0#01"), ("can1", "1C0#02"), ("can0", "1A0#03"), ("can1", "200#04")] {
+            stack.ok(&["can", "send", bus, frame]);
+        }
+    }
+    let done = |child: Child| {
+        let output = child.wait_with_output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8(output.stdout).unwrap()
+    };
+    let rows: Vec<Value> = done(dump).lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert!(rows.len() >= 8, "{rows:?}");
+    for row in &rows {
+        let (bus, id) = (row["bus"].as_str().unwrap(), row["id"].as_u64().unwrap());
+        assert!(matches!((bus, id), ("can0", 0x1B0) | ("can1", 0x1C0)), "{row}");
+        assert_eq!(row["echo"], true);
+    }
+    let stamps: Vec<i64> = rows.iter().map(|row| row["utc_ns"].as_i64().unwrap()).collect();
+    assert!(stamps.is_sorted(), "{stamps:?}");
+    assert!(rows.iter().any(|row| row["bus"] == "can1") && rows.iter().any(|row| row["bus"] == "can0"));
+    let changes = done(sniff);
+    assert!(changes.contains("1B0") && !changes.contains("1C0"), "{changes}");
+    let stats: Value = serde_json::from_str(&done(stats)).unwrap();
+    assert_eq!(stats["buses"].as_array().unwrap().len(), 2);
+    let row = stats["ids"].as_array().unwrap().iter().find(|row| row["id"] == 0x1C0).unwrap();
+    assert!(row["frames"].as_u64().unwrap() >= 4 && row["period_mean_ms"].as_f64().unwrap() > 0.0, "{row}");
+
+    // Refusals say what to do.
+    let say = |args: &[&str]| {
+        let output = stack.cli(args);
+        (output.status.code().unwrap(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    let (code, said) = say(&["can", "dump", "cna1"]);
+    assert!(code == 1 && said.contains("has no CAN bus 'cna1' (did you mean 'can1'?); it has can0, can1"), "{said}");
+    let (code, said) = say(&["can", "dump", "can0", "--filter", "#eror"]);
+    assert!(code == 2 && said.contains("did you mean '#error'?"), "{said}");
+    let (code, said) = say(&["can", "send", "can0", "20000080#00"]);
+    assert!(code == 2 && said.contains("is an error frame: a controller makes them"), "{said}");
+    let (code, said) = say(&["can", "gen", "can0", "--len", "9"]);
+    assert!(code == 2 && said.contains("9 data bytes: a classic frame carries at most 8"), "{said}");
+    let two = stack.scratch.write("two.log", "(1.0) a 123#01\n(1.0) b 123#02\n");
+    let (code, said) = say(&["can", "replay", text(&two)]);
+    assert!(code == 2 && said.contains("the file has frames of a, b, the stack has can0, can1"), "{said}");
+    let wrong = stack.scratch.write("wrong.log", "(1.0) can0 123#01\n(1.1) can0 12#01\n");
+    let (code, said) = say(&["can", "replay", text(&wrong), "--bus", "can0"]);
+    assert!(code == 1 && said.contains("wrong.log:2: identifier `12` must have 3 hex digits"), "{said}");
+    assert_eq!(stack.take_down(), 0);
+}
+
+/// A log with every kind of frame that the formats have in common: python-can takes an empty FD frame of an ASC file for a
+/// remote one.
+fn mix() -> String {
+    let kinds = [
+        "123#", "123#11", "7FF#1122334455667788", "00000123#01", "1FFFFFFF#A1B2", "123#R", "123#R8", "12345678#R3",
+        "123##0AA", "123##1000102030405060708090A0B", "00000001##2FF", "1ABCDEF0##311223344", "20000080#0000000000000000",
+    ];
+    let long = (0..64u8).map(|b| format!("{b:02X}")).collect::<String>();
+    let mut log = String::new();
+    for i in 0..500u64 {
+        let us = 1_506_783_973_191_777 + i * 1009;
+        let frame = if i % 14 == 13 { format!("456##1{long}") } else { kinds[(i % 14) as usize].to_owned() };
+        log += &format!("({}.{:06}) can{} {frame}\n", us / 1_000_000, us % 1_000_000, i % 3);
+    }
+    log
+}
+
+#[test]
+fn python_can_reads_what_is_exported_and_writes_what_is_imported() {
+    let Some(mut python) = peers::peer("can_logs.py") else { return };
+    let scratch = Scratch::new("logs");
+    let mut sources = vec![scratch.write("mix.log", mix())];
+    if let Some(cases) = cases() {
+        sources.push(cases.join("canlogs/savvycan/examples_candump.log"));
+    }
+    let mut read = |path: &Path| {
+        let output = python_run(&mut python, &["read", text(path)]);
+        output.lines().map(|line| serde_json::from_str(line).unwrap()).collect::<Vec<Value>>()
+    };
+    for (i, source) in sources.iter().enumerate() {
+        let (recording, asc, candump, theirs) = (
+            scratch.0.join(format!("{i}.mcap")),
+            scratch.0.join(format!("{i}.asc")),
+            scratch.0.join(format!("{i}.log")),
+            scratch.0.join(format!("{i}.theirs.asc")),
+        );
+        let expected = read(source);
+        assert!(expected.len() >= 500);
+        ok(&["recordings", "import", text(source), "-o", text(&recording)]);
+        let info: Value = serde_json::from_str(&ok(&["recordings", "info", text(&recording), "--json"])).unwrap();
+        assert_eq!((&info["finished"], &info["messages"]), (&true.into(), &expected.len().into()), "{info}");
+        ok(&["recordings", "export", text(&recording), "-o", text(&asc)]);
+        ok(&["recordings", "export", text(&recording), "-o", text(&candump)]);
+        same(&read(&candump), &expected, "candump");
+        same(&read(&asc), &expected, "ASC");
+        // And what python-can makes of it, read by us. Its stamps count from the first frame.
+        let mut convert = peers::peer("can_logs.py").unwrap();
+        python_run(&mut convert, &["convert", text(source), text(&theirs)]);
+        let back = scratch.0.join(format!("{i}.back.log"));
+        ok(&["recordings", "export", text(&theirs), "-o", text(&back), "--format", "candump"]);
+        let relative = |rows: Vec<Value>| -> Vec<Value> {
+            let first = rows[0][0].as_i64().unwrap();
+            rows.into_iter()
+                .map(|mut row| {
+                    row[0] = (row[0].as_i64().unwrap() - first).into();
+                    row
+                })
+                .collect()
+        };
+        same(&relative(read(&back)), &relative(expected), "python-can's ASC");
+    }
+    let (code, said) = refused(&["recordings", "import", text(&sources[0]), "-o", text(&scratch.0.join("0.mcap"))]);
+    assert!(code == 1 && said.contains("is there already: name another output, or give --force"), "{said}");
+    let csv = scratch.write("x.csv", "Time Stamp,ID,Extended\n");
+    let (code, said) = refused(&["recordings", "import", text(&csv), "-o", text(&scratch.0.join("x.mcap"))]);
+    assert!(code == 1 && said.contains("x.csv:1: ") && said.contains("can_logconvert"), "{said}");
+    assert!(!scratch.0.join("x.mcap").exists());
+}
+
+/// The peer with other arguments.
+fn python_run(python: &mut std::process::Command, args: &[&str]) -> String {
+    let program = python.get_program().to_owned();
+    let fixed: Vec<_> = python.get_args().map(std::ffi::OsStr::to_owned).collect();
+    let output = std::process::Command::new(program).args(fixed).args(args).output().unwrap();
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// Equal, stamps to one microsecond.
+fn same(got: &[Value], expected: &[Value], what: &str) {
+    assert_eq!(got.len(), expected.len(), "{what}");
+    for (i, (got, expected)) in got.iter().zip(expected).enumerate() {
+        let (a, b) = (got.as_array().unwrap(), expected.as_array().unwrap());
+        let apart = (a[0].as_i64().unwrap() - b[0].as_i64().unwrap()).abs();
+        assert!(apart <= 1 && a[1..] == b[1..], "{what}, frame {i}: {got} instead of {expected}");
+    }
+}
+
+#[test]
+fn an_imported_log_plays_in_a_drivers_place() {
+    let scratch = Scratch::new("inplace");
+    let log = scratch.write("one.log", "(1.000) vcan0 123#0102\n(1.010) vcan0 00000123#R2\n(1.020) vcan0 456##1AA\n");
+    ok(&["recordings", "import", text(&log), "-o", text(&scratch.0.join("one.mcap")), "--bus", "can0"]);
+    let toml = r#"
+[stack]
+name = "NAME"
+
+[[service]]
+name = "can0"
+kind = "replay"
+file = "one.mcap"
+loop = true
+"#;
+    let mut stack = Stack::spawn_in("inplace", toml, scratch, &[]);
+    stack.wait_ready();
+    let dumped = frames(&stack.ok(&["can", "dump", "can0", "--count", "9", "--for", "20s"]));
+    for frame in ["123#0102", "00000123#R2", "456##1AA"] {
+        assert_eq!(dumped.iter().filter(|f| *f == frame).count(), 3, "{dumped:?}");
+    }
+    assert_eq!(stack.take_down(), 0);
+}
