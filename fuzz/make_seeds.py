@@ -40,6 +40,38 @@ seed("asc", "measurement", "date Sat Sep 30 10:06:13.191 pm 2017\nbase hex  time
 seed("asc", "decimal", "base dec  timestamps relative\n0.1 1 291 Rx d 2 255 16\n0.2 1 291x Tx r\n")
 seed("asc", "candump", "(1.5) can0 123#AABB T\n(1.6) vcan1 00000123##1CC\n")
 
+GREETING = b"CANNELLONIv1"
+seed("cannelloni", "session", GREETING + bytes.fromhex("00000123 02 0102 9ABCDEF0 00 40000123 04 00000001 81 05 09 20000004 08 0010000000008000"))
+seed("cannelloni", "fd", GREETING + bytes.fromhex("800007FF C0 04") + bytes(64) + bytes.fromhex("00000123 80 07"))
+seed("cannelloni", "nonsense", GREETING + bytes.fromhex("00000001 C1 00"))
+seed("cannelloni", "other", "GET / HTTP/1.1\r\n")
+
+# As the kernel writes them: identifier with its class in the machine's byte order, length, 3 bytes, 8 data bytes.
+for name, identifier, data in (
+    ("bus_off", 0x20000040, "0000000000000000"), ("restarted", 0x20000100, "0000000000000000"),
+    ("passive", 0x20000204, "0030000000008180"), ("ack", 0x200000A8, "0000801900000000"),
+    ("arbitration", 0x20000002, "0500000000000000"), ("transceiver", 0x20000010, "0000000047000000"),
+    ("data", 0x123, "0102030405060708"),
+):
+    seed("error_frame", name, pack("<IB3x", identifier, 8) + bytes.fromhex(data))
+
+
+def adapter(*pieces: tuple[int, int, bytes]) -> bytes:
+    """Time in 20 ms, whether the driver sends a frame, what the adapter says."""
+    return b"".join(bytes([time, len(text) | (0x40 if send else 0)]) + text for time, send, text in pieces)
+
+
+opened = [(1, 0, b"\r"), (4, 0, b"\r"), (1, 0, b"\r"), (1, 0, b"\r")]
+seed("slcan_client", "session", b"\x06" + adapter(*opened, (1, 1, b"t1232AABB\r"), (1, 1, b"z\r"), (50, 0, b"zF00\r"), (1, 0, b"T1ABCDEF00\r")))
+seed("slcan_client", "stamps_and_fd", b"\x1e" + adapter(*opened, (1, 0, b"\r"), (1, 0, b"t12300ABC\rd12390011223344556677889900AA\r"), (9, 1, b"\x07")))
+seed("slcan_client", "bus_off", b"\x06" + adapter(*opened, *[(1, 1, b"\x07")] * 12, (9, 0, b"\r"), *opened, (1, 1, b"z\r")))
+seed("slcan_client", "silent", b"\x06" + adapter(*[(20, 1, b"")] * 12))
+seed("slcan_client", "nonsense", b"\x06" + adapter(*[(1, 0, b"GPS $GPGGA,1,2\r")] * 10))
+
+seed("socketcand_client", "session", "< hi >< ok >< ok >< frame 123 12.345678 DEADBEEF >< frame 1ABCDEF0 0.0  >< rtr 123 1.0 4 >< error 20000080 1.5 >")
+seed("socketcand_client", "refused", "< hi >< error no such bus on this server >")
+seed("socketcand_client", "nonsense", "HTTP/1.1 400 Bad Request\r\n\r\n< hi >< fly >< frame 123 1.0 DEA >" + "a" * 600)
+
 # --- Modbus ----------------------------------------------------------------------------------------------------
 
 REQUESTS = {

@@ -58,6 +58,10 @@ pub enum EventKind {
     Client,
     /// A bus changed state.
     BusState,
+    /// A node of a CANopen network was booted, lost, returned or refused.
+    NodeState,
+    /// A CANopen node sent an emergency message.
+    Emcy,
 }
 
 /// The JSON body of an event.

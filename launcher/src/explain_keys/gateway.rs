@@ -120,7 +120,7 @@ pub const RECORDER: &[KeyDoc] = &[
     with(
         "index",
         Bool,
-        "true",
+        "false",
         "Write indexes for readers that jump to a time or topic (Foxglove, PlotJuggler), 16 bytes a message; without, they read the file from the start.",
     ),
     with(

@@ -6,3 +6,4 @@
 pub mod config;
 pub mod master;
 pub mod protocol;
+pub mod service;

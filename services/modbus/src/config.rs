@@ -35,7 +35,7 @@ pub enum OnStop {
 /// Most serial lines of a server.
 pub const MAX_LINES: usize = 8;
 
-/// The keys `tcp` and `rtu_over_tcp`.
+/// The key `tcp`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Tcp {
@@ -97,6 +97,55 @@ impl<'de> Deserialize<'de> for UnitIds {
             }
         }
         deserializer.deserialize_any(Visit)
+    }
+}
+
+/// The key `rtu_over_tcp`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RtuOverTcp {
+    pub port: u16,
+    /// Units answered.
+    #[serde(default = "unit_one")]
+    pub unit: UnitIds,
+    /// Whether unit 255 is answered as the first of them.
+    #[serde(default)]
+    pub answer_255: bool,
+    #[serde(default = "any_address")]
+    pub address: IpAddr,
+    #[serde(default = "eight")]
+    pub max_connections: u32,
+    #[serde(default)]
+    pub filter: Option<Filter>,
+    #[serde(default = "one_minute")]
+    pub idle_timeout: Span,
+    #[serde(default)]
+    pub when_full: WhenFull,
+}
+
+fn any_address() -> IpAddr {
+    Tcp::default().address
+}
+
+fn eight() -> u32 {
+    Tcp::default().max_connections
+}
+
+fn one_minute() -> Span {
+    Tcp::default().idle_timeout
+}
+
+impl RtuOverTcp {
+    /// What it has in common with Modbus TCP.
+    pub fn tcp(&self) -> Tcp {
+        Tcp {
+            address: self.address,
+            port: self.port,
+            max_connections: self.max_connections,
+            filter: self.filter.clone(),
+            idle_timeout: self.idle_timeout,
+            when_full: self.when_full,
+        }
     }
 }
 
@@ -164,12 +213,10 @@ pub struct Config {
     pub plc: Option<String>,
     /// Absent: the default if there is no other transport, else none.
     pub tcp: Option<Tcp>,
-    pub rtu_over_tcp: Option<Tcp>,
+    pub rtu_over_tcp: Option<RtuOverTcp>,
     pub serial: Vec<SerialLine>,
     /// Units served on TCP besides 0 and 255; all when absent.
     pub units: Option<Vec<u8>>,
-    /// Units answered on RTU over TCP.
-    pub rtu_over_tcp_unit: UnitIds,
     pub map: MapConfig,
     pub unit: Vec<UnitEntry>,
     pub rights: Vec<RightsEntry>,
@@ -200,7 +247,6 @@ impl Default for Config {
             rtu_over_tcp: None,
             serial: Vec::new(),
             units: None,
-            rtu_over_tcp_unit: unit_one(),
             map: MapConfig::default(),
             unit: Vec::new(),
             rights: Vec::new(),
@@ -346,8 +392,9 @@ impl Config {
 
     /// Clients that the list of `clients_to` has room for.
     pub fn client_slots(&self) -> u32 {
-        let most = |tcp: Option<&Tcp>| tcp.map_or(0, |tcp| tcp.max_connections);
-        (most(self.tcp().as_ref()).saturating_add(most(self.rtu_over_tcp.as_ref()))).min(MAX_CLIENT_SLOTS)
+        let tcp = self.tcp().map_or(0, |tcp| tcp.max_connections);
+        let rtu = self.rtu_over_tcp.as_ref().map_or(0, |rtu| rtu.max_connections);
+        tcp.saturating_add(rtu).min(MAX_CLIENT_SLOTS)
     }
 
     /// Byte of %I and length of the list of clients.

@@ -3,11 +3,11 @@
 
 mod common;
 
-use common::{Rig, TempDir, frame, keyframe, one_of_each, stack, wait_for};
+use common::{Rig, TempDir, frame, keyframe, message, one_of_each, stack, wait_for};
 use dinrail_recorder::reader::{Item, Recording};
 use dinrail_recorder::{Config, Filter, Format, cat, disk, info, scan, scan_contents};
 use ipc_types::clock;
-use ipc_types::topic::TopicKind;
+use ipc_types::topic::{EVENTS, TopicKind};
 use ipc_types::units::Size;
 use std::path::Path;
 use std::sync::atomic::Ordering;
@@ -328,4 +328,21 @@ fn a_program_loaded_while_recording_stands_in_this_file_and_the_next() {
     // A recorder that starts later finds it without the event.
     let files = Rig::start(stack, Config::default()).stop();
     assert_eq!(names(files.last().unwrap()).into_iter().map(|(name, _)| name).collect::<Vec<_>>(), both);
+}
+
+#[test]
+fn a_moment_has_no_rate() {
+    let dir = TempDir::new("rate");
+    let mut rig = Rig::start(stack(dir.path()), Config::default());
+    let t = clock::mono_ns();
+    // Two parts of a keyframe, 1 us apart; frames over a second.
+    rig.send(&[keyframe(1, t), keyframe(2, t + 1000)]);
+    rig.send(&[frame(1, t), frame(2, t + 500_000_000), frame(3, t + 1_000_000_000)]);
+    let found = info(&rig.stop()[0]).unwrap();
+    let rate = |topic: &str| found.channels.iter().find(|c| c.topic == topic).unwrap().rate;
+    assert_eq!((rate("plc/keyframe"), rate("can0/rx"), rate("io/inputs")), (None, Some(2.0), None));
+    let shown = found.to_string();
+    let line = shown.lines().find(|l| l.contains("plc/keyframe")).unwrap();
+    let cells: Vec<_> = line.split_whitespace().collect();
+    assert_eq!((cells[1], cells[3]), ("2", "-"), "{line}");
 }

@@ -1,11 +1,11 @@
-//! How many frames a second a virtual bus carries to one subscriber without loss.
+//! How many frames a second a virtual bus carries to one subscriber without loss; then a full bus and the foreign programs.
 //!
 //! A thread sends as fast as the driver takes frames, this one receives; both have a place of their own on the
 //! rail. Every frame carries a counter, and the bus numbers what it publishes.
 
 use super::machine::CpuMeter;
-use super::stack::BenchStack;
-use super::{Bench, Goal};
+use super::stack::{BenchStack, free_port};
+use super::{Bench, Goal, bus_full, bus_peers};
 use anyhow::{anyhow, ensure};
 use ipc_types::Context;
 use ipc_types::payload::CanFrame;
@@ -34,6 +34,31 @@ name = "NAME"
 name = "can0"
 kind = "can"
 backend = "virtual"
+serve = { cannelloni = "127.0.0.1:CANNELLONI", socketcand = "127.0.0.1:SOCKETCAND", slcan = "127.0.0.1:SLCAN" }
+
+[[service]]
+name = "full"
+kind = "can"
+backend = "virtual"
+bitrate = "1M"
+pace = true
+
+[[service]]
+name = "io"
+kind = "can-io"
+bus = "full"
+
+[[service.in]]
+id = 0x100
+start = 0
+len = 16
+to = "%IW0"
+type = "UINT"
+
+[[service]]
+name = "plc"
+kind = "plc"
+cycle = "10ms"
 "#;
 
 #[derive(Default)]
@@ -65,9 +90,15 @@ impl Received {
 
 pub fn run(bench: &mut Bench) -> anyhow::Result<()> {
     let seconds = bench.seconds(SECONDS);
-    let mut stack = BenchStack::up(&bench.dir, "bus", STACK, &[])?;
+    let ports =
+        bus_peers::Ports { cannelloni: free_port()?, socketcand: free_port()?, slcan: free_port()? };
+    let toml = STACK
+        .replace("CANNELLONI", &ports.cannelloni.to_string())
+        .replace("SOCKETCAND", &ports.socketcand.to_string())
+        .replace("SLCAN", &ports.slcan.to_string());
+    let mut stack = BenchStack::up(&bench.dir, "bus", &toml, &[])?;
     {
-        let ctx = stack.join()?;
+        let mut ctx = stack.join()?;
         let mut rx = ctx.subscriber::<CanFrame>("can0/rx")?;
         let cpu = CpuMeter::start(stack.processes()?);
         let (sent, received) = traffic(&mut stack, &ctx.stack.root, &mut rx, Duration::from_secs(seconds))?;
@@ -83,6 +114,10 @@ pub fn run(bench: &mut Bench) -> anyhow::Result<()> {
         for (name, percent) in cpu.into_iter().filter(|(name, _)| name == "can0") {
             bench.info(format!("CPU of {name}"), percent, "%");
         }
+        drop(rx);
+        bus_full::run(bench, &mut stack, &mut ctx)?;
+        let dir = stack.dir().to_owned();
+        bus_peers::run(bench, &ports, &dir)?;
     }
     stack.down()?;
     Ok(())

@@ -79,12 +79,14 @@ impl Test {
 }
 
 fn parse_one(text: &str, names: &Names, turned: &mut bool) -> Result<Test, UsageError> {
+    // Without the # as well: shells take it for a comment where it is not quoted.
+    let kind = KINDS.iter().find(|(name, _)| name.trim_start_matches('#').eq_ignore_ascii_case(text.trim_start_matches('#')));
+    if let Some((_, test)) = kind {
+        return Ok(test.clone());
+    }
     if text.starts_with('#') {
-        let kind = KINDS.iter().find(|(name, _)| name.eq_ignore_ascii_case(text));
-        return kind.map(|(_, test)| test.clone()).ok_or_else(|| {
-            let hint = suggestion(text, "kinds of frames", KINDS.iter().map(|(name, _)| *name));
-            UsageError(format!("filter '{text}': {hint}"))
-        });
+        let hint = suggestion(text, "kinds of frames", KINDS.iter().map(|(name, _)| *name));
+        return Err(UsageError(format!("filter '{text}': {hint}")));
     }
     let parts = |separator| text.split_once(separator).and_then(|(a, b)| Some((identifier(a)?, hex(b)?)));
     if let Some(((value, extended), mask)) = parts(':') {
@@ -180,6 +182,7 @@ mod tests {
             (&["00000000:1FFFFFF0"], "x"),
             (&["#error", "#fd"], "ef"),
             (&["#RTR"], "r"),
+            (&["error", "!ext"], "e"),
             (&["#tx"], "t"),
             (&["#rx", "!#error"], "srfx"),
             (&["!#ext"], "srtef"),

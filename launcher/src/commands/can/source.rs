@@ -103,7 +103,7 @@ fn next_line(
         line.clear();
         // Bounded, so that a file without line ends is no danger.
         let limit = logfile::MAX_LINE as u64 + 2;
-        let read = file.take(limit).read_until(b'\n', line);
+        let read = Read::take(&mut *file, limit).read_until(b'\n', line);
         if read.map_err(|e| anyhow::anyhow!("reading {}: {e}", path.display()))? == 0 {
             return Ok(None);
         }

@@ -60,7 +60,7 @@ pub struct Point {
 }
 
 /// Everything of one moment.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, Default)]
 pub struct Snapshot {
     /// CLOCK_MONOTONIC and UTC in ns.
     pub t_ns: u64,

@@ -44,7 +44,7 @@ pub fn run(stack: Option<&str>, every: Duration) -> anyhow::Result<()> {
     let signal = signals::descriptor(&[libc::SIGTERM, libc::SIGINT, libc::SIGHUP])?;
     let stack = find(stack)?;
     let feed = Feed::open(&stack)?;
-    let model = Model::new(&stack.stack, every.as_millis() as u64);
+    let model = Model::new(&stack.stack);
     // Sets a panic hook that restores the terminal first.
     let terminal = ratatui::try_init().context("preparing the terminal")?;
     let (done, results) = channel();

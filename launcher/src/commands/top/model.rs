@@ -52,7 +52,6 @@ pub enum View {
 #[derive(Debug, Default)]
 pub struct Model {
     pub stack: String,
-    pub every_ms: u64,
     pub now: Snapshot,
     /// The status before the last one of each service, for rates.
     before: BTreeMap<String, Told>,
@@ -71,8 +70,8 @@ pub struct Model {
 }
 
 impl Model {
-    pub fn new(stack: &str, every_ms: u64) -> Self {
-        Self { stack: stack.to_owned(), every_ms, ..Self::default() }
+    pub fn new(stack: &str) -> Self {
+        Self { stack: stack.to_owned(), ..Self::default() }
     }
 
     /// Shows a new moment of the stack.
@@ -115,11 +114,6 @@ impl Model {
 
     pub fn selected_service(&self) -> Option<&str> {
         self.now.rows.get(self.selected).map(|r| r.service.as_str())
-    }
-
-    /// The last status of a service.
-    pub fn status(&self, service: &str) -> Option<&Value> {
-        self.now.told.iter().find(|t| t.service == service).map(|t| &t.body)
     }
 
     /// How fast a counter of a service's status grows, per second. `None` before there are two statuses of one
@@ -237,7 +231,7 @@ mod tests {
     use super::*;
 
     fn model() -> Model {
-        let mut model = Model::new("demo", 1000);
+        let mut model = Model::new("demo");
         model.take(snapshot(0));
         model
     }

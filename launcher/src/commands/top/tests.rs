@@ -135,7 +135,7 @@ fn event(second: i64, level: Level, service: &str, message: &str) -> EventBody {
 }
 
 fn model() -> Model {
-    let mut model = Model::new("demo", 1000);
+    let mut model = Model::new("demo");
     let mut first = snapshot(0);
     first.events = vec![
         event(-70, Level::Info, "plc", "program main.st loaded"),
@@ -198,7 +198,7 @@ fn a_question_and_a_stack_that_went_down() {
 
 #[test]
 fn before_the_first_look_and_with_nonsense_in_it() {
-    let empty = Model::new("demo", 1000);
+    let empty = Model::new("demo");
     assert!(screen(&empty, 80, 24).contains("stack demo"));
     let mut odd = snapshot(3);
     for told in &mut odd.told {

@@ -8,7 +8,7 @@
 //! Nothing allocates after [`Exchange::new`].
 
 use crate::protocol::io::Outbox;
-use ipc_types::payload::{CanFrame, Quality, id_flag};
+use ipc_types::payload::{CanFrame, Quality, can_flag, id_flag};
 
 /// PDO transmission types (CiA 301 V4.2, tables 69 and 73).
 pub mod transmission {
@@ -474,7 +474,8 @@ impl Exchange {
 
     fn frame(can_id: u32, data: [u8; PDO_BYTES], length: u8) -> CanFrame {
         let len = length.min(PDO_BYTES as u8);
-        let mut frame = CanFrame { can_id, len, ..CanFrame::default() };
+        // Only the newest value counts: one that still waits for the bus is replaced.
+        let mut frame = CanFrame { can_id, len, flags: can_flag::NEWEST, ..CanFrame::default() };
         frame.data[..usize::from(len)].copy_from_slice(&data[..usize::from(len)]);
         frame
     }

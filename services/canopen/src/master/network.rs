@@ -356,6 +356,28 @@ impl Network {
         self.settle(now_ns, out);
     }
 
+    /// Boots a node from the beginning, as a user asks; false when there is no such node.
+    pub fn boot_again(&mut self, now_ns: u64, node: u8, out: &mut Outbox) -> bool {
+        let Some(i) = self.find(node) else { return false };
+        self.transfers.cancel(node, Owner::Boot);
+        let run = &mut self.nodes[i];
+        (run.watch, run.state, run.last_failure) = (None, None, None);
+        run.boot.stop();
+        run.boot.start(now_ns);
+        self.gate(now_ns, i);
+        self.settle(now_ns, out);
+        true
+    }
+
+    /// The outputs once more before the master ends: synchronous ones behind a last SYNC.
+    pub fn last_outputs(&mut self, now_ns: u64, out: &mut Outbox) {
+        if self.settings.sync_period_ns.is_some() && !self.bus_off {
+            self.next_sync_ns = Some(now_ns);
+            self.sync(now_ns, out);
+        }
+        self.exchange.on_time(now_ns, out);
+    }
+
     /// The safe state of the outputs by NMT; `None` leaves it.
     pub fn set_safe(&mut self, now_ns: u64, safe: Option<NmtCommand>, out: &mut Outbox) {
         if self.safe == safe {
@@ -382,8 +404,9 @@ impl Network {
         self.exchange.show_state(node.id(), node.state.unwrap_or(0));
     }
 
-    /// Takes a frame of the bus, our own echoes too. `t_ns` is when it was on the bus.
-    pub fn on_frame(&mut self, t_ns: u64, frame: &CanFrame, echo: bool, out: &mut Outbox) {
+    /// Takes a frame of the bus, our own echoes too: our SYNC opens a window when it is on the bus, not when it is
+    /// sent. `t_ns` is when it was on the bus.
+    pub fn on_frame(&mut self, t_ns: u64, frame: &CanFrame, out: &mut Outbox) {
         if frame.is_error() {
             self.on_error_frame(t_ns, frame);
             return self.settle(t_ns, out);
@@ -396,10 +419,8 @@ impl Network {
             return;
         }
         let id = frame.id();
-        if echo {
-            if id == self.settings.sync_cob_id && !frame.is_remote() {
-                self.exchange.on_sync(t_ns);
-            }
+        if id == self.settings.sync_cob_id && !frame.is_remote() {
+            self.exchange.on_sync(t_ns);
             return;
         }
         let node = (id & 0x7F) as u8;
@@ -408,9 +429,7 @@ impl Network {
             predefined::ERROR_CONTROL if !frame.is_remote() && node != 0 => {
                 self.on_error_control(t_ns, node, frame.payload())
             }
-            predefined::EMCY if node != 0 && id != self.settings.sync_cob_id => {
-                self.on_emcy(node, frame.payload())
-            }
+            predefined::EMCY if node != 0 => self.on_emcy(node, frame.payload()),
             _ => {
                 self.exchange.on_frame(t_ns, frame);
                 return;

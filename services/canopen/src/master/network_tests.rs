@@ -67,7 +67,7 @@ impl Bus {
         while let Some((from, frame)) = wait.pop_front() {
             self.log.push((from, frame));
             let mut out = Outbox::default();
-            self.network.on_frame(self.now, &frame, from == 0, &mut out);
+            self.network.on_frame(self.now, &frame, &mut out);
             wait.extend(out.drain().map(|f| (0, f)));
             for slave in &mut self.slaves {
                 if slave.id != from {

@@ -173,6 +173,10 @@ impl EmcyProducer {
     pub fn is_active(&self, code: u16, source: u16) -> bool {
         self.active.iter().any(|error| error.code == code && error.source == source)
     }
+    /// A source that has this error now.
+    pub fn first_source(&self, code: u16) -> Option<u16> {
+        self.active.iter().find(|error| error.code == code).map(|error| error.source)
+    }
     /// An error has come. Tells the message, if the error is new: an error that is already there is not sent again
     /// (CiA 301 V4.2, 7.2.7.1: once per error event).
     pub fn raise(&mut self, code: u16, source: u16, register: u8, info: [u8; 5]) -> Option<Emcy> {
@@ -338,8 +342,12 @@ mod tests {
         let mut emcy = EmcyProducer::new(254);
         emcy.configure(CobId(0x84), 0);
         for n in 0..1000u16 {
-            emcy.raise(0xFF00, n, register::MANUFACTURER, n.to_le_bytes().iter().copied().chain([0; 3]).collect::<Vec<_>>()
-                .try_into().unwrap());
+            emcy.raise(
+                0xFF00,
+                n,
+                register::MANUFACTURER,
+                n.to_le_bytes().iter().copied().chain([0; 3]).collect::<Vec<_>>().try_into().unwrap(),
+            );
         }
         assert_eq!((emcy.history().len(), emcy.dropped), (254, 1000 - ACTIVE as u64));
         assert_eq!(emcy.history()[0], 0x03E7_FF00);

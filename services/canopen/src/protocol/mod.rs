@@ -4,7 +4,15 @@
 pub mod abort;
 pub mod cob_id;
 pub mod data_type;
+pub mod emcy;
+pub mod error_control;
 pub mod io;
+pub mod lss;
 pub mod nmt;
+pub mod node;
 pub mod od;
+pub mod pdo;
 pub mod sdo;
+pub mod store;
+pub mod sync;
+pub mod time_stamp;

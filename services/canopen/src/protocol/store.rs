@@ -27,20 +27,26 @@ pub const IMAGE_BYTES: usize = 16 << 20;
 /// Why an image was not taken.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum StoreError {
-    #[error("the stored parameters are {0} bytes long, which no image has; remove the file to start with defaults")]
+    #[error(
+        "the stored parameters are {0} bytes long, which no image has; remove the file to start with defaults"
+    )]
     Length(usize),
     #[error("this is no file of stored CANopen parameters")]
     Magic,
     #[error("the stored parameters have format {0}, this version reads format {VERSION}")]
     Version(u32),
-    #[error("the check sum of the stored parameters is wrong: the file is damaged; remove it to start with defaults")]
+    #[error(
+        "the check sum of the stored parameters is wrong: the file is damaged; remove it to start with defaults"
+    )]
     Checksum,
     #[error(
         "the stored parameters are another device's: device type {device_type:08X}h, vendor {vendor:08X}h, \
          product {product:08X}h"
     )]
     OtherDevice { device_type: u32, vendor: u32, product: u32 },
-    #[error("the records of the stored parameters do not fit their length; remove the file to start with defaults")]
+    #[error(
+        "the records of the stored parameters do not fit their length; remove the file to start with defaults"
+    )]
     Records,
 }
 
@@ -57,14 +63,18 @@ pub fn group(sub: u8) -> RangeInclusive<u16> {
 
 /// Values that are states or commands, not parameters.
 fn is_parameter(entry: &Entry) -> bool {
-    let stated = matches!(entry.index, 0x1001..=0x1003 | 0x1010 | 0x1011 | 0x1013 | 0x1023..=0x1025 | 0x1F50..=0x1F5F);
+    let stated =
+        matches!(entry.index, 0x1001..=0x1003 | 0x1010 | 0x1011 | 0x1013 | 0x1023..=0x1025 | 0x1F50..=0x1F5F);
     entry.access.writable() && entry.access != Access::Wo && !stated
 }
 
 /// CRC-32 (ISO-HDLC, as in zip and Ethernet).
 pub fn crc32(bytes: &[u8]) -> u32 {
     !bytes.iter().fold(u32::MAX, |crc, &byte| {
-        (0..8).fold(crc ^ u32::from(byte), |crc, _| if crc & 1 != 0 { crc >> 1 ^ 0xEDB8_8320 } else { crc >> 1 })
+        (0..8).fold(
+            crc ^ u32::from(byte),
+            |crc, _| if crc & 1 != 0 { crc >> 1 ^ 0xEDB8_8320 } else { crc >> 1 },
+        )
     })
 }
 
@@ -112,7 +122,8 @@ impl Store {
         if image.is_empty() {
             return Ok(Self::default());
         }
-        let end = image.len().checked_sub(CHECKSUM).filter(|&end| end >= HEADER && image.len() <= IMAGE_BYTES);
+        let end =
+            image.len().checked_sub(CHECKSUM).filter(|&end| end >= HEADER && image.len() <= IMAGE_BYTES);
         let end = end.ok_or(StoreError::Length(image.len()))?;
         if image[..4] != MAGIC {
             return Err(StoreError::Magic);

@@ -112,7 +112,10 @@ impl Sync {
     }
     /// A frame of the bus, if it is a SYNC of others. A producer ignores others' SYNCs.
     pub fn on_frame(&mut self, t_ns: u64, frame: &CanFrame) -> Option<SyncEvent> {
-        if frame.is_remote() || !self.params.cob.exists() || !self.params.cob.matches(frame) || self.params.produces()
+        if frame.is_remote()
+            || !self.params.cob.exists()
+            || !self.params.cob.matches(frame)
+            || self.params.produces()
         {
             return None;
         }

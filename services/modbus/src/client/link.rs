@@ -285,7 +285,7 @@ fn response_pdu(response: &Response, function: u8) -> Vec<u8> {
             pdu.extend(rest);
         }
         Response::ReadDeviceIdentification(found) => {
-            pdu.extend([14, found.read_code as u8, found.conformity_level as u8]);
+            pdu.extend([14, found.read_code.value(), found.conformity_level.value()]);
             pdu.push(if found.more_follows { 0xFF } else { 0 });
             pdu.extend([found.next_object_id, found.device_id_objects.len() as u8]);
             for object in &found.device_id_objects {

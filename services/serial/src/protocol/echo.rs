@@ -46,9 +46,9 @@ impl Echo {
         (self.len, self.at, self.until_ns) = (n, 0, until_ns);
     }
 
-    /// Waits until another time for what has not come back yet.
-    pub fn extend(&mut self, until_ns: u64) {
-        self.until_ns = self.until_ns.max(until_ns);
+    /// What has not come back by then will not.
+    pub fn end_at(&mut self, until_ns: u64) {
+        self.until_ns = until_ns;
     }
 
     /// Says how many bytes at the beginning of `bytes` are our own.

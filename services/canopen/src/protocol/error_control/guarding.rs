@@ -209,7 +209,10 @@ mod tests {
         // Both come back.
         let rtr = cob(5).remote(1);
         out.drain().count();
-        assert_eq!(slave.on_frame(1300 * MS, 5, NmtState::Operational, &rtr, &mut out), Some(LifeEvent::Resolved));
+        assert_eq!(
+            slave.on_frame(1300 * MS, 5, NmtState::Operational, &rtr, &mut out),
+            Some(LifeEvent::Resolved)
+        );
         let answer: Vec<_> = out.drain().collect();
         let back = master.on_frame(1300 * MS, &answer[0]);
         assert_eq!(back, Some(GuardEvent::Resolved { node_id: 5, state: NmtState::Operational }));

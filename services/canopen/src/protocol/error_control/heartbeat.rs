@@ -116,7 +116,9 @@ impl HeartbeatConsumer {
     /// Takes the value of sub-index `sub` (1-127). An entry that is written, even with the same value, waits for
     /// its first heartbeat again.
     pub fn configure(&mut self, sub: u8, value: u32) {
-        let Some(entry) = usize::from(sub).checked_sub(1).and_then(|at| self.entries.get_mut(at)) else { return };
+        let Some(entry) = usize::from(sub).checked_sub(1).and_then(|at| self.entries.get_mut(at)) else {
+            return;
+        };
         let (node_id, time_ms) = split_consumer_time(value);
         *entry = Consumer::default();
         if is_used(value) {
@@ -145,11 +147,13 @@ impl HeartbeatConsumer {
     }
     /// A frame, if it is the heartbeat or boot-up of a watched node.
     pub fn on_frame(&mut self, t_ns: u64, frame: &CanFrame) -> Option<HeartbeatEvent> {
-        let node_id = frame.can_id.checked_sub(predefined::ERROR_CONTROL).filter(|id| (1..=127).contains(id))? as u8;
+        let node_id =
+            frame.can_id.checked_sub(predefined::ERROR_CONTROL).filter(|id| (1..=127).contains(id))? as u8;
         let [value] = frame.payload() else { return None };
         let state = NmtState::from_wire(*value)?;
-        let entry =
-            self.entries[..self.used].iter_mut().find(|entry| entry.time_ns > 0 && entry.node_id == node_id)?;
+        let entry = self.entries[..self.used]
+            .iter_mut()
+            .find(|entry| entry.time_ns > 0 && entry.node_id == node_id)?;
         if state == NmtState::Initialising {
             // A boot-up message is no heartbeat (7.2.8.3.3): it neither starts nor feeds the monitoring. Of a node
             // that was active it says that the node was reset; it is lost again if no heartbeat follows in time.
@@ -223,14 +227,21 @@ mod tests {
         assert_eq!(consumer.on_frame(50 * MS, &heartbeat_frame(6, NmtState::PreOperational)), None);
         assert_eq!(
             consumer.on_frame(100 * MS, &heartbeat_frame(5, NmtState::Operational)),
-            Some(HeartbeatEvent::State { node_id: 5, from: NmtState::PreOperational, to: NmtState::Operational })
+            Some(HeartbeatEvent::State {
+                node_id: 5,
+                from: NmtState::PreOperational,
+                to: NmtState::Operational
+            })
         );
         let boot = consumer.on_frame(150 * MS, &heartbeat_frame(5, NmtState::Initialising));
         assert_eq!(boot, Some(HeartbeatEvent::BootUp { node_id: 5 }));
         assert_eq!(consumer.on_time(200 * MS), Some(HeartbeatEvent::Lost { node_id: 5 }));
         assert_eq!(consumer.on_time(200 * MS), None);
         assert!(consumer.any_lost());
-        assert_eq!(consumer.on_frame(300 * MS, &heartbeat_frame(5, NmtState::PreOperational)), Some(resolved));
+        assert_eq!(
+            consumer.on_frame(300 * MS, &heartbeat_frame(5, NmtState::PreOperational)),
+            Some(resolved)
+        );
         assert!(!consumer.any_lost());
     }
 
@@ -241,7 +252,9 @@ mod tests {
             consumer.configure(node_id, u32::from(node_id) << 16 | 10);
         }
         for node_id in 1..=127u8 {
-            assert!(consumer.on_frame(u64::from(node_id), &heartbeat_frame(node_id, NmtState::Stopped)).is_some());
+            assert!(
+                consumer.on_frame(u64::from(node_id), &heartbeat_frame(node_id, NmtState::Stopped)).is_some()
+            );
         }
         let lost = std::iter::from_fn(|| consumer.on_time(11 * MS)).count();
         assert_eq!(lost, 127);

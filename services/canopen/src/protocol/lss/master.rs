@@ -65,7 +65,9 @@ pub enum LssRequest {
     /// Index in table 0.
     ConfigureBitTiming(u8),
     /// Never answered.
-    ActivateBitTiming { delay_ms: u16 },
+    ActivateBitTiming {
+        delay_ms: u16,
+    },
     Store,
     Inquire(Inquiry),
     /// Does any slave lie in this range?
@@ -230,12 +232,11 @@ impl LssMaster {
                 job.due_ns = t_ns.saturating_add(u64::from(times.settle_ms) * MS);
                 None
             }
-            LssRequest::ConfigureNodeId(_) | LssRequest::ConfigureBitTiming(_) | LssRequest::Store => {
-                self.finish(match data[1] {
+            LssRequest::ConfigureNodeId(_) | LssRequest::ConfigureBitTiming(_) | LssRequest::Store => self
+                .finish(match data[1] {
                     0 => LssResult::Done,
                     code => LssResult::Refused { code, specific: data[2] },
-                })
-            }
+                }),
             LssRequest::Inquire(Inquiry::NodeId) => self.finish(LssResult::Value(u32::from(data[1]))),
             LssRequest::Inquire(_) => self.finish(LssResult::Value(u32_of(&data))),
             _ => self.finish(LssResult::Done),
@@ -323,8 +324,14 @@ fn write_script(request: &LssRequest, script: &mut [CanFrame; SCRIPT]) -> usize 
         LssRequest::Store => simple(cs::STORE, 0, 0),
         LssRequest::Inquire(inquiry) => simple(inquiry as u8, 0, 0),
         LssRequest::Identify(range) => {
-            let values =
-                [range.vendor, range.product, range.revision.0, range.revision.1, range.serial.0, range.serial.1];
+            let values = [
+                range.vendor,
+                range.product,
+                range.revision.0,
+                range.revision.1,
+                range.serial.0,
+                range.serial.1,
+            ];
             for (at, value) in values.into_iter().enumerate() {
                 script[at] = command_u32(cs::IDENTIFY_VENDOR + at as u8, value);
             }

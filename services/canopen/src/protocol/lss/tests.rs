@@ -16,7 +16,14 @@ struct Bus {
 
 impl Bus {
     fn new(slaves: Vec<LssSlave>) -> Self {
-        Self { t_ns: 0, master: LssMaster::new(LssTimes::default()), slaves, events: Vec::new(), frames: 0, lose: 0 }
+        Self {
+            t_ns: 0,
+            master: LssMaster::new(LssTimes::default()),
+            slaves,
+            events: Vec::new(),
+            frames: 0,
+            lose: 0,
+        }
     }
     fn run(&mut self, request: LssRequest) -> LssResult {
         self.master.start(self.t_ns, request).unwrap();
@@ -52,7 +59,12 @@ impl Bus {
 }
 
 fn address(n: u32) -> LssAddress {
-    LssAddress { vendor: 0x0000_0360, product: 0x1234_5678 + (n & 1), revision: n >> 1, serial: n.wrapping_mul(0x9E37_79B9) }
+    LssAddress {
+        vendor: 0x0000_0360,
+        product: 0x1234_5678 + (n & 1),
+        revision: n >> 1,
+        serial: n.wrapping_mul(0x9E37_79B9),
+    }
 }
 
 fn slave(n: u32, node_id: u8) -> LssSlave {
@@ -80,7 +92,8 @@ fn fastscan_finds_eight_unconfigured_slaves_and_gives_them_node_ids() {
     let mut wanted: Vec<_> = (0..8).map(address).collect();
     wanted.sort_by_key(|address| address.parts());
     assert_eq!(found, wanted, "ascending, because silence counts as 1");
-    let active = bus.events.iter().filter(|(_, event)| matches!(event, LssSlaveEvent::NodeIdActive { .. })).count();
+    let active =
+        bus.events.iter().filter(|(_, event)| matches!(event, LssSlaveEvent::NodeIdActive { .. })).count();
     assert_eq!(active, 8);
     assert!(bus.t_ns < 120_000_000_000, "{} s", bus.t_ns / 1_000_000_000);
 }
@@ -88,7 +101,8 @@ fn fastscan_finds_eight_unconfigured_slaves_and_gives_them_node_ids() {
 #[test]
 fn fastscan_with_known_parts_is_short_and_says_when_nobody_has_them() {
     let mut bus = Bus::new(vec![slave(1, UNCONFIGURED), slave(2, UNCONFIGURED)]);
-    let hint = FastscanHint { vendor: Some(0x360), product: Some(0x1234_5678), revision: Some(1), serial: None };
+    let hint =
+        FastscanHint { vendor: Some(0x360), product: Some(0x1234_5678), revision: Some(1), serial: None };
     assert_eq!(bus.run(LssRequest::Fastscan(hint)), LssResult::Found(address(2)));
     bus.run(LssRequest::SwitchGlobal(LssState::Waiting));
     let other = FastscanHint { vendor: Some(0x361), ..hint };

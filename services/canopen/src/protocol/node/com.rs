@@ -102,9 +102,19 @@ impl Com {
     pub fn configure_pdo(&mut self, t_ns: u64, od: &ObjectDictionary, index: u16, sub: u8, out: &mut Outbox) {
         self.pdos.after_write(t_ns, od, index, sub, out);
         if let Some((pdo::Direction::Receive, number, _)) = pdo::role(index) {
-            // A PDO that is configured anew has neither of its errors.
+            // A PDO that is configured anew has none of its errors.
             if !self.pdos.is_overdue(number) {
                 self.clear(emcy::code::RPDO_TIMEOUT, number);
+            }
+            self.clear(emcy::code::PDO_TOO_SHORT, number);
+            self.clear(emcy::code::PDO_TOO_LONG, number);
+        }
+    }
+    /// The node left operational: PDOs are not watched any more, so none of them has an error.
+    pub fn clear_pdo_errors(&mut self) {
+        for code in [emcy::code::RPDO_TIMEOUT, emcy::code::PDO_TOO_SHORT, emcy::code::PDO_TOO_LONG] {
+            while let Some(source) = self.emcy.first_source(code) {
+                self.clear(code, source);
             }
         }
     }
@@ -157,12 +167,20 @@ pub fn pdo_event(emcy: &mut EmcyProducer, events: &mut Events, event: PdoEvent) 
     };
     let message = match event {
         PdoEvent::Received { number } => return events.push(NodeEvent::Received { number }),
-        // The error is over with the frame: a message each time, nothing stays in 1001h.
-        PdoEvent::TooShort { number, id, .. } => Some(emcy.report(PDO_TOO_SHORT, communication, info(id, number))),
-        PdoEvent::TooLong { number, id, .. } => Some(emcy.report(PDO_TOO_LONG, communication, info(id, number))),
+        // One message until the length is right again: a wrong producer does not make a storm of EMCYs.
+        PdoEvent::TooShort { number, id, .. } => {
+            emcy.raise(PDO_TOO_SHORT, number, communication, info(id, number))
+        }
+        PdoEvent::TooLong { number, id, .. } => {
+            emcy.raise(PDO_TOO_LONG, number, communication, info(id, number))
+        }
+        PdoEvent::LengthRight { number } => {
+            let short = emcy.clear(PDO_TOO_SHORT, number);
+            short.into_iter().chain(emcy.clear(PDO_TOO_LONG, number)).last()
+        }
         PdoEvent::Timeout { number, id } => emcy.raise(RPDO_TIMEOUT, number, communication, info(id, number)),
         PdoEvent::Resumed { number } => emcy.clear(RPDO_TIMEOUT, number),
-        PdoEvent::LengthRight { .. } | PdoEvent::OutsideWindow { .. } => None,
+        PdoEvent::OutsideWindow { .. } => None,
     };
     events.push(NodeEvent::Rpdo(event));
     if let Some(message) = message {

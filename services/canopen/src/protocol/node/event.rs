@@ -18,15 +18,24 @@ pub const EVENTS: usize = 2048;
 pub enum NodeEvent {
     /// The node was reset. `application`: reset node, its writable objects have their defaults or stored values again;
     /// otherwise reset communication, only 1000h-1FFFh have. Comes before the change of state.
-    Reset { application: bool },
-    State { from: NmtState, to: NmtState },
+    Reset {
+        application: bool,
+    },
+    State {
+        from: NmtState,
+        to: NmtState,
+    },
     /// The values of this RPDO (0-based) are in the dictionary.
-    Received { number: u16 },
+    Received {
+        number: u16,
+    },
     /// Something was wrong, or is right again, with an RPDO.
     Rpdo(PdoEvent),
     /// A SYNC was received or produced, and all that hangs on it is done: synchronous RPDOs are in the dictionary,
     /// synchronous TPDOs in the outbox. `counter` is 0 without SYNC counter.
-    Sync { counter: u8 },
+    Sync {
+        counter: u8,
+    },
     /// SYNC stays away.
     SyncTimeout,
     SyncResolved,
@@ -37,14 +46,22 @@ pub enum NodeEvent {
     /// An EMCY message of this node.
     EmcyRaised(Emcy),
     /// An EMCY message of a consumed node (1028h).
-    EmcyReceived { node_id: u8, emcy: Emcy },
+    EmcyReceived {
+        node_id: u8,
+        emcy: Emcy,
+    },
     /// The network wrote this object by SDO.
-    Written { index: u16, sub: u8 },
+    Written {
+        index: u16,
+        sub: u8,
+    },
     /// What is stored changed: keep [`Node::store_image`](super::Node::store_image).
     StoreChanged,
     Lss(LssSlaveEvent),
     /// Another device uses this node-id.
-    DuplicateNodeId { node_id: u8 },
+    DuplicateNodeId {
+        node_id: u8,
+    },
 }
 
 /// Queue of events with a limit.

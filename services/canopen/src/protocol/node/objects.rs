@@ -43,7 +43,9 @@ pub fn check_write(od: &ObjectDictionary, index: u16, sub: u8, data: &[u8]) -> R
         SYNC_COB_ID => sync_cob_id(od, CobId(value)),
         TIME_COB_ID => time_cob_id(od, CobId(value)),
         EMCY_COB_ID => pdo::check::cob_id(CobId(od.u32(EMCY_COB_ID, 0).unwrap_or(u32::MAX)), CobId(value)),
-        EMCY_CONSUMER if sub > 0 => pdo::check::cob_id(CobId(od.u32(index, sub).unwrap_or(u32::MAX)), CobId(value)),
+        EMCY_CONSUMER if sub > 0 => {
+            pdo::check::cob_id(CobId(od.u32(index, sub).unwrap_or(u32::MAX)), CobId(value))
+        }
         HEARTBEAT_CONSUMER if sub > 0 => heartbeat_consumer(od, sub, value),
         SYNC_OVERFLOW => sync_overflow(od, value),
         ERROR_BEHAVIOUR if sub > 0 => {
@@ -76,9 +78,9 @@ fn time_cob_id(od: &ObjectDictionary, new: CobId) -> Result<(), Abort> {
 fn heartbeat_consumer(od: &ObjectDictionary, sub: u8, value: u32) -> Result<(), Abort> {
     let node = |value: u32| heartbeat::is_used(value).then(|| heartbeat::split_consumer_time(value).0);
     let Some(wanted) = node(value) else { return Ok(()) };
-    let twice = (1..=127).filter(|&other| other != sub).any(|other| {
-        od.u32(HEARTBEAT_CONSUMER, other).and_then(node) == Some(wanted)
-    });
+    let twice = (1..=127)
+        .filter(|&other| other != sub)
+        .any(|other| od.u32(HEARTBEAT_CONSUMER, other).and_then(node) == Some(wanted));
     if twice { Err(Abort::PARAMETER) } else { Ok(()) }
 }
 

@@ -21,7 +21,11 @@ pub fn write(od: &ObjectDictionary, index: u16, sub: u8, data: &[u8]) -> Result<
         if cob.exists() {
             return Err(Abort::UNSUPPORTED_ACCESS);
         }
-        return if sub == 0 { count(od, index, value, direction) } else { entry(od, index, value, direction) };
+        return if sub == 0 {
+            count(od, index, value, direction)
+        } else {
+            entry(od, index, value, direction)
+        };
     }
     match sub {
         sub::COB_ID => cob_id(cob, CobId(value)),

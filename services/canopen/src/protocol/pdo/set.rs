@@ -189,7 +189,14 @@ impl Pdos {
         }
     }
     /// An object changed: TPDOs of type 0, 254 and 255 that map it have their event.
-    pub fn object_changed(&mut self, t_ns: u64, od: &ObjectDictionary, index: u16, sub: u8, out: &mut Outbox) {
+    pub fn object_changed(
+        &mut self,
+        t_ns: u64,
+        od: &ObjectDictionary,
+        index: u16,
+        sub: u8,
+        out: &mut Outbox,
+    ) {
         if !self.operational {
             return;
         }

@@ -318,6 +318,9 @@ fn transfers(
             prop_assert_eq!(read, &value);
         }
         pair.settle();
+        if faults.loss + faults.repeat + faults.swap == 0 && faults.delay_ns <= 50_000_000 {
+            prop_assert!(result.is_ok() && read.is_ok(), "{:?} {:?}", result, read);
+        }
         for failure in [result.err(), read.err()].into_iter().flatten() {
             prop_assert!(fine.contains(&failure.abort), "{:?}", failure);
         }

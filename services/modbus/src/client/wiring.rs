@@ -1,0 +1,166 @@
+//! What the service declares and checks without starting.
+
+use super::config::{Config, Mode, OnBad as OnBadWord};
+use super::image::InputTable;
+use super::plan::{Plan, ReadRange, Target, plan};
+use crate::map_config::traditional_number;
+use dinrail_iec::{Addressing, parse_address};
+use ipc_types::stack::ServiceEntry;
+use ipc_types::topic::TopicKind;
+use ipc_types::wiring::{Area, ImageRange, Neighbours, OnBad, TopicDecl};
+use ipc_types::{Finding, Stack, Wiring, plc_table};
+
+/// What the service needs of the launcher.
+pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
+    let plc = neighbours.resolve("plc", config.plc.as_deref());
+    let addressing = Addressing::from_name(neighbours.addressing(plc.as_deref())).unwrap_or_default();
+    let Plan { lines, reads, writes, .. } = plan(config, addressing);
+    let mut wiring = Wiring { plc, ..Wiring::default() };
+    if !reads.is_empty() {
+        let tail = InputTable::new(&reads).tail().len() as u32;
+        wiring.topics.push(TopicDecl::new(TopicKind::Inputs).max_tail(tail.max(1)));
+    }
+    wiring.own(TopicKind::Jobs).own(TopicKind::Results);
+    let me = &neighbours.name;
+    wiring.read(TopicKind::Jobs.of(me), true, "");
+    if let Some(plc) = wiring.plc.clone().filter(|_| !writes.is_empty()) {
+        wiring.read(TopicKind::Image.of(&plc), true, "plc");
+    }
+    for line in &lines {
+        if let Target::Serial { service, .. } = &line.target {
+            wiring.read(TopicKind::SerialRx.of(service), true, "serial");
+            wiring.write(TopicKind::SerialTx.of(service), "serial");
+        }
+    }
+    wiring.inputs = reads.iter().map(|range| input_range(config, range)).collect();
+    for range in &writes {
+        let write = &config.writes[range.index];
+        wiring.outputs.push(ImageRange {
+            area: range.area,
+            byte: range.byte,
+            bit: (range.table.is_bits() && range.count == 1).then_some(range.bit),
+            bytes: range.bytes,
+            type_name: type_name(&write.from, write.iec, write.symbol.is_some(), addressing),
+            symbol: write.symbol.clone(),
+            label: format!("to unit {}, {}", range.unit, points(range.table, range.at, range.count)),
+            key: format!("write[{}].from", range.index),
+            on_bad: OnBad::Hold,
+            status_byte: None,
+        });
+    }
+    wiring
+}
+
+fn points(table: crate::server::Table, at: u16, count: u16) -> String {
+    let first = traditional_number(table, at);
+    if count == 1 {
+        format!("{} {at} ({first})", table.name())
+    } else {
+        format!("{} {at}-{} ({first}...)", table.name(), u32::from(at) + u32::from(count) - 1)
+    }
+}
+
+/// IEC type of a symbol: as given, or by the width of its address.
+fn type_name(
+    address: &str,
+    iec: Option<super::config::IecType>,
+    symbol: bool,
+    addressing: Addressing,
+) -> Option<String> {
+    if let Some(iec) = iec {
+        return Some(iec.name().to_owned());
+    }
+    let bits = parse_address(address, addressing).ok().filter(|_| symbol)?.size.bits();
+    Some(match bits {
+        1 => "BOOL",
+        8 => "BYTE",
+        16 => "WORD",
+        32 => "DWORD",
+        _ => "LWORD",
+    })
+    .map(str::to_owned)
+}
+
+fn input_range(config: &Config, range: &ReadRange) -> ImageRange {
+    let read = &config.reads[range.index];
+    // The width of an address does not depend on how it counts.
+    let type_name = type_name(&read.to, read.iec, read.symbol.is_some(), Addressing::default());
+    ImageRange {
+        area: Area::Input,
+        byte: range.byte,
+        bit: range.bit,
+        bytes: range.bytes,
+        type_name,
+        symbol: read.symbol.clone(),
+        label: format!("from unit {}, {}", range.unit, points(range.table, range.at, range.count)),
+        key: format!("read[{}].to", range.index),
+        on_bad: match range.on_bad {
+            OnBadWord::Hold => OnBad::Hold,
+            OnBadWord::Zero => OnBad::Zero,
+        },
+        status_byte: range.status_byte,
+    }
+}
+
+/// The plc service whose image is exchanged, and how its addresses count.
+pub(super) fn plc_of<'a>(stack: &'a Stack, wiring: &Wiring) -> (Option<&'a ServiceEntry>, Addressing) {
+    let plc = wiring.plc.as_deref().and_then(|plc| stack.service(plc)).filter(|plc| plc.kind == "plc");
+    let addressing = plc.and_then(|plc| Addressing::from_name(plc_table::addressing(&plc.config)));
+    (plc, addressing.unwrap_or_default())
+}
+
+/// What is wrong with the serial service of a key, if anything.
+pub(crate) fn check_serial(me: &str, key: &str, service: &str, ascii: bool, stack: &Stack) -> Vec<Finding> {
+    let Some(entry) = stack.service(service).filter(|s| s.kind == "serial") else {
+        let names: Vec<&str> =
+            stack.services.iter().filter(|s| s.kind == "serial").map(|s| s.name.as_str()).collect();
+        let help = if names.is_empty() {
+            "add a [[service]] with kind = \"serial\"".to_owned()
+        } else {
+            format!("set it to one of: {}", names.join(", "))
+        };
+        return vec![Finding::error(me, key, format!("there is no serial service '{service}'"), help)];
+    };
+    let framing = entry.config.get("framing").and_then(|f| f.as_str());
+    let wanted = if ascii { "ascii" } else { "rtu" };
+    match framing {
+        Some(framing) if framing != wanted => {
+            let message = format!("serial service '{service}' has framing \"{framing}\"");
+            vec![Finding::error(me, key, message, format!("set framing = \"{wanted}\" there, or change mode here"))]
+        }
+        _ => Vec::new(),
+    }
+}
+
+/// Every mistake that can be found without starting.
+pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> {
+    let name = &me.name;
+    let (plc, addressing) = plc_of(stack, &me.wiring);
+    let plan = plan(config, addressing);
+    let mut found: Vec<Finding> =
+        plan.mistakes.iter().map(|m| Finding::error(name, &m.key, &m.message, &m.help)).collect();
+    if config.reads.is_empty() && config.writes.is_empty() {
+        let help = "add [[service.read]] or [[service.write]]; jobs of others are carried out in any case";
+        found.push(Finding::warning(name, "", "the service has neither read nor write", help));
+    }
+    if let Some(service) = &config.serial {
+        found.extend(check_serial(name, "serial", service, config.mode == Some(Mode::Ascii), stack));
+    }
+    if config.plc.is_none() && plc.is_none() && !(config.reads.is_empty() && config.writes.is_empty()) {
+        let count = stack.services.iter().filter(|s| s.kind == "plc").count();
+        let (message, help) = if count == 0 {
+            ("the stack has no plc service", "add a [[service]] with kind = \"plc\"; it works without a program too")
+        } else {
+            ("the stack has several plc services", "say which one: plc = \"NAME\"")
+        };
+        found.push(Finding::error(name, "plc", message, help));
+    }
+    if !config.writes.is_empty() {
+        found.extend(plc.and_then(|plc| plc_table::check_stale_after(name, config.stale_after, plc)));
+    }
+    found
+}
+
+#[cfg(test)]
+#[path = "wiring_tests.rs"]
+mod tests;

@@ -1,0 +1,90 @@
+//! What the service declares and checks. The running service is tested in `tests/`.
+
+use super::*;
+use serde_json::{Value, json};
+
+fn config(value: Value) -> Config {
+    serde_json::from_value(value).unwrap()
+}
+
+fn entry(name: &str, kind: &str, config: Value) -> ServiceEntry {
+    ServiceEntry { name: name.into(), kind: kind.into(), index: 1, config, wiring: Wiring::default() }
+}
+
+fn stack(services: Vec<ServiceEntry>) -> Stack {
+    Stack {
+        name: "test".into(),
+        file: "stack.toml".into(),
+        dir: ".".into(),
+        text: String::new(),
+        build_id: String::new(),
+        root: "/nonexistent".into(),
+        prefix: "x".into(),
+        services,
+        topics: vec![],
+    }
+}
+
+fn demo() -> Value {
+    json!({
+        "serial": "com1",
+        "read": [
+            { "unit": 5, "table": "input", "at": 0, "to": "%ID1", "type": "REAL", "symbol": "Power", "status_to": "%IB40" },
+            { "unit": 5, "table": "coils", "at": 3, "count": 12, "to": "%IX8.0", "on_bad": "zero" },
+        ],
+        "write": [{ "unit": 5, "table": "holding", "at": 100, "from": "%QW0", "symbol": "Limit" }],
+    })
+}
+
+#[test]
+fn wiring() {
+    let neighbours = Neighbours {
+        name: "meters".into(),
+        services: vec![("com1".into(), "serial".into()), ("meters".into(), "modbus-client".into()), ("plc".into(), "plc".into())],
+        dir: ".".into(),
+        ..Neighbours::default()
+    };
+    let wiring = topics(&config(demo()), &neighbours);
+    let reads: Vec<_> = wiring.reads.iter().map(|r| (r.topic.as_str(), r.wake)).collect();
+    assert_eq!(reads, [("meters/jobs", true), ("plc/image", true), ("com1/rx", true)]);
+    assert_eq!(wiring.writes, [("com1/tx".to_owned(), "serial".to_owned())]);
+    let kinds: Vec<_> = wiring.topics.iter().map(|t| (t.kind, t.max_tail)).collect();
+    assert_eq!(kinds[0], (TopicKind::Inputs, 4 + 2 + 2));
+    assert_eq!(kinds.len(), 3);
+    let inputs: Vec<_> =
+        wiring.inputs.iter().map(|r| (r.byte, r.bytes, r.type_name.as_deref(), r.label.as_str())).collect();
+    assert_eq!(
+        inputs,
+        [
+            (4, 4, Some("REAL"), "from unit 5, input_registers 0-1 (30001...)"),
+            (8, 2, None, "from unit 5, coils 3-14 (00004...)")
+        ]
+    );
+    assert_eq!((wiring.inputs[0].status_byte, wiring.inputs[1].on_bad), (Some(40), OnBad::Zero));
+    let out = &wiring.outputs[0];
+    assert_eq!((out.byte, out.type_name.as_deref(), out.key.as_str()), (0, Some("WORD"), "write[0].from"));
+}
+
+#[test]
+fn findings() {
+    let said = |value: Value, services: Vec<ServiceEntry>| {
+        let mut me = entry("meters", "modbus-client", Value::Null);
+        me.wiring.plc = services.iter().find(|s| s.kind == "plc").map(|s| s.name.clone());
+        let found = check(&config(value), &stack(services), &me);
+        found.iter().map(|f| format!("{}: {} -> {}", f.key, f.message, f.help)).collect::<Vec<_>>().join("\n")
+    };
+    let serial = |framing: &str| entry("com1", "serial", json!({ "framing": framing }));
+    let plc = || entry("plc", "plc", json!({ "cycle": "10ms" }));
+    assert_eq!(said(demo(), vec![serial("rtu"), plc()]), "");
+    let mut short = demo();
+    short["stale_after"] = json!("10ms");
+    let all = [
+        said(json!({ "tcp": "10.0.0.1:502" }), vec![]),
+        said(demo(), vec![plc()]),
+        said(demo(), vec![entry("com2", "serial", json!({})), plc()]),
+        said(demo(), vec![serial("ascii"), plc()]),
+        said(demo(), vec![serial("rtu")]),
+        said(short, vec![serial("rtu"), plc()]),
+    ];
+    insta::assert_snapshot!(all.join("\n"), @"");
+}

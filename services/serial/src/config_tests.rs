@@ -1,0 +1,76 @@
+use super::*;
+use serde_json::{Value, json};
+
+fn config(mut value: Value) -> Config {
+    if value.get("device").is_none() {
+        value["device"] = json!("pty:com1");
+    }
+    serde_json::from_value(value).unwrap()
+}
+
+fn said(value: Value) -> String {
+    config(value)
+        .findings("com1", Path::new("/nonexistent"))
+        .iter()
+        .map(|f| format!("{:?} {}: {} -> {}", f.severity, f.key, f.message, f.help))
+        .collect::<Vec<_>>()
+        .join("\n")
+}
+
+#[test]
+fn defaults_by_framing_and_preset() {
+    let shown = |value| config(value).character().to_string();
+    assert_eq!(shown(json!({})), "19200 8E1");
+    assert_eq!(shown(json!({ "framing": "ascii" })), "19200 7E1");
+    assert_eq!(shown(json!({ "preset": "device-L" })), "9600 8E1");
+    assert_eq!(shown(json!({ "preset": "device-L", "baud": 1200, "parity": "none", "stop_bits": 2 })), "1200 8N2");
+    assert_eq!(config(json!({})), Config { device: "pty:com1".into(), ..Config::of_device("x") });
+}
+
+#[test]
+fn the_kind_of_port_decides_what_time_means() {
+    let c = config(json!({ "pace": true, "echo": "discard", "reply_delay": "5ms" }));
+    let uart = c.settings(Kind::Uart);
+    assert!(uart.framer.timed && !uart.pace && uart.discard_echo && uart.sender.half_duplex);
+    let pty = c.settings(Kind::Pty);
+    assert!(pty.framer.timed && pty.sender.paced && pty.pace);
+    let plain = config(json!({ "framing": "raw" })).settings(Kind::Pty);
+    assert!(!plain.framer.timed && !plain.sender.timed && !plain.sender.half_duplex);
+    let rts = config(json!({ "rs485": "rts", "rts_delay_after": "300us", "framing": "raw" }));
+    assert_eq!(rts.settings(Kind::Uart).sender.rts, Some((0, 300_000)));
+    assert!(rts.settings(Kind::Uart).sender.half_duplex);
+    assert_eq!(rts.options(Path::new("/")).unwrap().rts_on_send, Some(true));
+    let kernel = config(json!({ "rs485": "kernel", "rts_on_send": false, "rts_delay_before": "2ms" }));
+    let rs485 = kernel.options(Path::new("/")).unwrap().rs485.unwrap();
+    assert_eq!((rs485.rts_on_send, rs485.delay_before_ms), (false, 2));
+    for (grace, kind) in [(20_000_000, Kind::Usb), (50_000_000, Kind::Tcp), (16 * 572_917, Kind::Uart)] {
+        let Mode::Rtu { grace_ns, .. } = config(json!({})).settings(kind).framer.mode else { panic!() };
+        assert_eq!(grace_ns, grace);
+    }
+}
+
+#[test]
+fn mistakes() {
+    let all = [
+        said(json!({})),
+        said(json!({ "device": "COM1" })),
+        said(json!({ "device": "/dev/ttyNOTHERE", "data_bits": 7, "baud": 9 })),
+        said(json!({ "framing": "ascii", "data_bits": 6, "stop_bits": 3 })),
+        said(json!({ "parity": "none" })),
+        said(json!({ "parity": "none", "stop_bits": 2 })),
+        said(json!({ "parity": "none", "framing": "raw", "data_bits": 5 })),
+        said(json!({ "flow": "xonxoff", "length": 4, "delimiter": "", "grace": "2min", "silence": "0" })),
+        said(json!({ "framing": "length" })),
+        said(json!({ "framing": "length", "length": 70000, "strict_t15": true })),
+        said(json!({ "device": "socket://10.0.0.1:4001", "rs485": "kernel", "rts_delay_after": "100us", "pace": true })),
+        said(json!({ "rs485": "rts", "flow": "rtscts", "max_frame": 0, "timeout": "0" })),
+    ];
+    insta::assert_snapshot!(all.join("\n"), @"");
+}
+
+#[test]
+fn unknown_keys_and_values_are_refused() {
+    for value in [json!({ "devise": "x" }), json!({}), json!({ "device": "x", "parity": "evn" })] {
+        assert!(serde_json::from_value::<Config>(value.clone()).is_err(), "{value}");
+    }
+}
