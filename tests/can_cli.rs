@@ -100,7 +100,21 @@ fn text(path: &Path) -> &str {
 fn generated_frames_are_dumped_recorded_and_replayed_in_their_order() {
     let mut stack = Stack::up("cancli", STACK, &[]);
     let dump = Dump::start(&stack, "can0", "gen.log");
-    let gen_args = ["can", "gen", "can0", "--mix", "--fd", "--gap", "0", "--count", "5000", "--seed", "42", "--in-order", "--json"];
+    let gen_args = [
+        "can",
+        "gen",
+        "can0",
+        "--mix",
+        "--fd",
+        "--gap",
+        "0",
+        "--count",
+        "5000",
+        "--seed",
+        "42",
+        "--in-order",
+        "--json",
+    ];
     let summary: Value = serde_json::from_str(&stack.ok(&gen_args)).unwrap();
     assert_eq!((&summary["sent"], &summary["echoed"]), (&5000.into(), &5000.into()), "{summary}");
     assert_eq!(summary["out_of_order"], 0, "{summary}");
@@ -120,9 +134,23 @@ fn generated_frames_are_dumped_recorded_and_replayed_in_their_order() {
     ok(&["recordings", "import", text(&log), "-o", text(&imported), "--bus", "can0"]);
     for file in [&log, &imported] {
         let dump = Dump::start(&stack, "can1", "replayed.log");
-        let args = ["can", "replay", text(file), "--bus", "can1", "--no-wait", "--filter", "!7F0", "--filter", "!7F1"];
+        let args = [
+            "can",
+            "replay",
+            text(file),
+            "--bus",
+            "can1",
+            "--no-wait",
+            "--filter",
+            "!7F0",
+            "--filter",
+            "!7F1",
+        ];
         let said = stack.ok(&args);
-        assert!(said.contains("frames sent") && said.contains("every one was seen on the bus, in order"), "{said}");
+        assert!(
+            said.contains("frames sent") && said.contains("every one was seen on the bus, in order"),
+            "{said}"
+        );
         let replayed = dump.end(&stack);
         let kept = |frames: &[String]| -> Vec<String> {
             frames.iter().filter(|f| !f.starts_with("7F0#") && !f.starts_with("7F1#")).cloned().collect()
@@ -154,7 +182,20 @@ fn the_car_log_is_replayed_bit_for_bit() {
     assert!(got == expected, "another order or other frames");
     // With its own timing, a part of it, fast.
     let begin = std::time::Instant::now();
-    let args = ["can", "replay", text(&log), "--bus", "can0", "--from", "1s", "--to", "3s", "--speed", "2", "--json"];
+    let args = [
+        "can",
+        "replay",
+        text(&log),
+        "--bus",
+        "can0",
+        "--from",
+        "1s",
+        "--to",
+        "3s",
+        "--speed",
+        "2",
+        "--json",
+    ];
     let said: Value = serde_json::from_str(&stack.ok(&args)).unwrap();
     assert!(begin.elapsed().as_millis() >= 900, "faster than asked for: {said}");
     assert_eq!(said["whole"], true, "{said}");
@@ -166,45 +207,79 @@ fn the_car_log_is_replayed_bit_for_bit() {
 fn several_buses_filters_statistics_and_changes() {
     let mut stack = Stack::up("buses", STACK, &[]);
     let spawn = |args: &[&str]| {
-        dinrail().args(args).args(["--stack", &stack.name]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+        dinrail()
+            .args(args)
+            .args(["--stack", &stack.name])
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap()
     };
-    let dump = spawn(&["can", "dump", "all", "--filter", "100-1FF,!1A0", "--for", "4s", "--json"]);
-    let sniff = spawn(&["can", "sniff", "can0", "--for", "4s"]);
-    let stats = spawn(&["can", "stats", "--for", "4s", "--json"]);
-    stack.wait("a second of frames", || {
-        for (bus, frame) in [("can0", "1B0#01"), ("can1", "1C0#02"), ("can0", "1A0#03"), ("can1", "200#04")] {
-            stack.ok(&["can", "send", bus, frame]);
-        }
-        stack.ok(&["can", "send", "can0", "1B0#FF", "--count", "3", "--every", "1ms"]);
-        Some(())
-    });
-    std::thread::sleep(std::time::Duration::from_secs(1));
-    for _ in 0..20 {
-        for (bus, frame) in [("can0", "1B0#01"), ("can1", "1C0#02"), ("can0", "1A0#03"), ("can1", "200#04")] {
-            stack.ok(&["can", "send", bus, frame]);
-        }
-    }
+    let dump = spawn(&[
+        "can",
+        "dump",
+        "all",
+        "--filter",
+        "100-1FF,!1A0,7C0",
+        "--count",
+        "200",
+        "--for",
+        "30s",
+        "--json",
+    ]);
+    let stats = spawn(&["can", "stats", "--for", "8s", "--json"]);
+    let rising = spawn(&["can", "gen", "can0", "--id", "inc:180", "--gap", "10ms", "--for", "7s"]);
+    let fixed = spawn(&[
+        "can", "gen", "can1", "--id", "7C0", "--gap", "10ms", "--for", "7s", "--data", "inc", "--len", "2",
+    ]);
     let done = |child: Child| {
         let output = child.wait_with_output().unwrap();
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         String::from_utf8(output.stdout).unwrap()
     };
     let rows: Vec<Value> = done(dump).lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-    assert!(rows.len() >= 8, "{rows:?}");
+    assert_eq!(rows.len(), 200);
     for row in &rows {
         let (bus, id) = (row["bus"].as_str().unwrap(), row["id"].as_u64().unwrap());
-        assert!(matches!((bus, id), ("can0", 0x1B0) | ("can1", 0x1C0)), "{row}");
+        assert!(matches!((bus, id), ("can0", 0x180..=0x1FF) | ("can1", 0x7C0)) && id != 0x1A0, "{row}");
         assert_eq!(row["echo"], true);
     }
     let stamps: Vec<i64> = rows.iter().map(|row| row["utc_ns"].as_i64().unwrap()).collect();
     assert!(stamps.is_sorted(), "{stamps:?}");
     assert!(rows.iter().any(|row| row["bus"] == "can1") && rows.iter().any(|row| row["bus"] == "can0"));
-    let changes = done(sniff);
-    assert!(changes.contains("1B0") && !changes.contains("1C0"), "{changes}");
     let stats: Value = serde_json::from_str(&done(stats)).unwrap();
     assert_eq!(stats["buses"].as_array().unwrap().len(), 2);
-    let row = stats["ids"].as_array().unwrap().iter().find(|row| row["id"] == 0x1C0).unwrap();
-    assert!(row["frames"].as_u64().unwrap() >= 4 && row["period_mean_ms"].as_f64().unwrap() > 0.0, "{row}");
+    let row = stats["ids"].as_array().unwrap().iter().find(|row| row["id"] == 0x7C0).unwrap();
+    assert!(row["frames"].as_u64().unwrap() >= 50 && row["period_mean_ms"].as_f64().unwrap() > 0.0, "{row}");
+
+    for child in [rising, fixed] {
+        let said = done(child);
+        assert!(said.contains(" sent in ") && said.contains(" seen on the bus"), "{said}");
+    }
+
+    let sniff = spawn(&["can", "sniff", "can0", "--for", "8s"]);
+    stack.ok(&["can", "gen", "can0", "--id", "inc:180", "--gap", "10ms", "--count", "300"]);
+    let changes = done(sniff);
+    assert!(changes.contains("  2AB  ") && !changes.contains("  7C0  "), "{changes}");
+
+    // Tools that were killed, or whose reader went away, take no place from those that come later.
+    for round in 0..6 {
+        let mut dump = spawn(&["can", "dump", "can0", "--json"]);
+        stack.wait("the dump listens", || {
+            stack.ok(&["can", "send", "can0", "7F0#AA"]);
+            let mut first = [0];
+            std::io::Read::read(dump.stdout.as_mut().unwrap(), &mut first).unwrap();
+            Some(())
+        });
+        if round % 2 == 0 {
+            drop(dump.stdout.take());
+            stack.ok(&["can", "send", "can0", "7F0#AA"]);
+        } else {
+            dump.kill().unwrap();
+        }
+        dump.wait().unwrap();
+    }
+    stack.ok(&["can", "send", "can0", "7F0#AA"]);
 
     // Refusals say what to do.
     let say = |args: &[&str]| {
@@ -212,7 +287,10 @@ fn several_buses_filters_statistics_and_changes() {
         (output.status.code().unwrap(), String::from_utf8_lossy(&output.stderr).into_owned())
     };
     let (code, said) = say(&["can", "dump", "cna1"]);
-    assert!(code == 1 && said.contains("has no CAN bus 'cna1' (did you mean 'can1'?); it has can0, can1"), "{said}");
+    assert!(
+        code == 1 && said.contains("has no CAN bus 'cna1' (did you mean 'can1'?); it has can0, can1"),
+        "{said}"
+    );
     let (code, said) = say(&["can", "dump", "can0", "--filter", "#eror"]);
     assert!(code == 2 && said.contains("did you mean '#error'?"), "{said}");
     let (code, said) = say(&["can", "send", "can0", "20000080#00"]);
@@ -232,8 +310,19 @@ fn several_buses_filters_statistics_and_changes() {
 /// remote one.
 fn mix() -> String {
     let kinds = [
-        "123#", "123#11", "7FF#1122334455667788", "00000123#01", "1FFFFFFF#A1B2", "123#R", "123#R8", "12345678#R3",
-        "123##0AA", "123##1000102030405060708090A0B", "00000001##2FF", "1ABCDEF0##311223344", "20000080#0000000000000000",
+        "123#",
+        "123#11",
+        "7FF#1122334455667788",
+        "00000123#01",
+        "1FFFFFFF#A1B2",
+        "123#R",
+        "123#R8",
+        "12345678#R3",
+        "123##0AA",
+        "123##1000102030405060708090A0B",
+        "00000001##2FF",
+        "1ABCDEF0##311223344",
+        "20000080#0000000000000000",
     ];
     let long = (0..64u8).map(|b| format!("{b:02X}")).collect::<String>();
     let mut log = String::new();
@@ -267,7 +356,8 @@ fn python_can_reads_what_is_exported_and_writes_what_is_imported() {
         let expected = read(source);
         assert!(expected.len() >= 500);
         ok(&["recordings", "import", text(source), "-o", text(&recording)]);
-        let info: Value = serde_json::from_str(&ok(&["recordings", "info", text(&recording), "--json"])).unwrap();
+        let info: Value =
+            serde_json::from_str(&ok(&["recordings", "info", text(&recording), "--json"])).unwrap();
         assert_eq!((&info["finished"], &info["messages"]), (&true.into(), &expected.len().into()), "{info}");
         ok(&["recordings", "export", text(&recording), "-o", text(&asc)]);
         ok(&["recordings", "export", text(&recording), "-o", text(&candump)]);
@@ -289,7 +379,8 @@ fn python_can_reads_what_is_exported_and_writes_what_is_imported() {
         };
         same(&relative(read(&back)), &relative(expected), "python-can's ASC");
     }
-    let (code, said) = refused(&["recordings", "import", text(&sources[0]), "-o", text(&scratch.0.join("0.mcap"))]);
+    let (code, said) =
+        refused(&["recordings", "import", text(&sources[0]), "-o", text(&scratch.0.join("0.mcap"))]);
     assert!(code == 1 && said.contains("is there already: name another output, or give --force"), "{said}");
     let csv = scratch.write("x.csv", "Time Stamp,ID,Extended\n");
     let (code, said) = refused(&["recordings", "import", text(&csv), "-o", text(&scratch.0.join("x.mcap"))]);
@@ -319,7 +410,8 @@ fn same(got: &[Value], expected: &[Value], what: &str) {
 #[test]
 fn an_imported_log_plays_in_a_drivers_place() {
     let scratch = Scratch::new("inplace");
-    let log = scratch.write("one.log", "(1.000) vcan0 123#0102\n(1.010) vcan0 00000123#R2\n(1.020) vcan0 456##1AA\n");
+    let log = scratch
+        .write("one.log", "(1.000) vcan0 123#0102\n(1.010) vcan0 00000123#R2\n(1.020) vcan0 456##1AA\n");
     ok(&["recordings", "import", text(&log), "-o", text(&scratch.0.join("one.mcap")), "--bus", "can0"]);
     let toml = r#"
 [stack]

@@ -16,7 +16,8 @@ fn a_real_car_is_decoded_by_the_program_read_by_modbus_and_recorded_frame_by_fra
     let (can_port, modbus_port) = (free_port(), free_port());
     let Some(mut player) = peers::peer("play_candump.py") else { return };
 
-    let mut stack = Stack::up("car", &car::on_a_virtual_bus(can_port, modbus_port), &[("car.st", car::PROGRAM)]);
+    let mut stack =
+        Stack::up("car", &car::on_a_virtual_bus(can_port, modbus_port), &[("car.st", car::PROGRAM)]);
     let played = player
         .args(["127.0.0.1", &can_port.to_string(), "can0"])
         .arg(&log_path)

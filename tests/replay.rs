@@ -142,6 +142,27 @@ fn forces_starts_and_stops_verify_too() {
 }
 
 #[test]
+fn a_program_loaded_from_elsewhere_verifies_from_the_file_alone() {
+    let elsewhere = Scratch::new("elsewhere");
+    let other = elsewhere.write("other.st", PROGRAM.replace("1700", "900"));
+    let stack = run("elsewhere", 0.5, |stack, _| {
+        stack.ok(&["plc", "load", other.to_str().unwrap()]);
+        sleep(Duration::from_millis(300));
+    });
+    // Neither the source nor what the plc left in shared memory is there any more.
+    std::fs::remove_file(&other).unwrap();
+    let recording = &stack.recordings()[0];
+    let info = dinrail().args(["recordings", "info", "--json"]).arg(recording).output().unwrap();
+    let info: serde_json::Value = serde_json::from_slice(&info.stdout).unwrap();
+    let names = info["attachments"].as_array().unwrap().iter().filter_map(|a| a["name"].as_str());
+    let modules = names.filter(|name| name.starts_with("plc.") && name.ends_with(".wasm")).count();
+    assert_eq!(modules, 2, "{info}");
+    let (code, report, said) = verify(recording, &[]);
+    assert_eq!(code, 0, "{said}");
+    assert!(report["scans_verified"].as_u64().unwrap() > 100, "{said}");
+}
+
+#[test]
 fn a_changed_constant_is_named_by_scan_and_variable() {
     let stack = run("constant", 6.0, |_, _| {});
     let other = stack.scratch.write("other.st", PROGRAM.replace("1700", "1500"));

@@ -45,9 +45,9 @@ impl Work {
     /// What a driver counted, as it says at its end.
     fn sum(&self, service: &str) -> String {
         let log = self.text("up.log");
-        let line = log.lines().find(|line| {
-            line.split_whitespace().nth(1) == Some(service) && line.contains(" in all: ")
-        });
+        let line = log
+            .lines()
+            .find(|line| line.split_whitespace().nth(1) == Some(service) && line.contains(" in all: "));
         line.unwrap_or_else(|| panic!("no sum of {service} in\n{log}")).to_owned()
     }
 }
@@ -111,7 +111,8 @@ fn boot(script: &str, work: &Work) -> Option<()> {
         let _ = guest.kill();
     }
     let _ = guest.wait();
-    let logs = || ["kernel.log", "insmod.log", "script.log", "up.log"].map(|name| work.text(name)).join("\n---\n");
+    let logs =
+        || ["kernel.log", "insmod.log", "script.log", "up.log"].map(|name| work.text(name)).join("\n---\n");
     assert!(work.0.join("booted").exists(), "the guest did not boot:\n{}", logs());
     assert!(work.0.join("exec").exists(), "the guest's /tmp does not allow to execute:\n{}", logs());
     assert!(work.0.join("done").exists(), "the guest ended early or hung:\n{}", logs());
@@ -168,8 +169,7 @@ fn a_real_car_through_the_kernel() {
     let Some(mut reader) = peers::peer("frames_of.py") else { return };
     let output = reader.arg("can0/rx").args(&recordings).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let recorded: Vec<_> =
-        String::from_utf8(output.stdout).unwrap().lines().map(str::to_owned).collect();
+    let recorded: Vec<_> = String::from_utf8(output.stdout).unwrap().lines().map(str::to_owned).collect();
     same(&recorded, &frames, "the recording");
     for recording in &recordings {
         let verified = support::dinrail().args(["replay", "--verify"]).arg(recording).output().unwrap();
@@ -181,7 +181,11 @@ fn a_real_car_through_the_kernel() {
 fn same(got: &[String], wanted: &[String], what: &str) {
     let differs = got.iter().zip(wanted).position(|(a, b)| a != b);
     let shown = differs.map(|n| (n, &got[n], &wanted[n]));
-    assert!(shown.is_none() && got.len() == wanted.len(), "{what}: {} frames, first difference {shown:?}", got.len());
+    assert!(
+        shown.is_none() && got.len() == wanted.len(),
+        "{what}: {} frames, first difference {shown:?}",
+        got.len()
+    );
 }
 
 /// Sent by the stack: on the wire once and in order; on `rx` once, in the same order, marked as ours.
@@ -224,7 +228,8 @@ fn frames_of_others(work: &Work) {
         "{log}"
     );
     assert!(log.contains("vcan0 is bus-off"), "{log}");
-    let nobody = "vcan0: nobody acknowledges what is sent (no acknowledgement): termination, bit rate, partner?";
+    let nobody =
+        "vcan0: nobody acknowledges what is sent (no acknowledgement): termination, bit rate, partner?";
     assert!(log.contains(nobody), "{log}");
     assert!(log.contains("there is no interface 'nocan7' (CAN interfaces here: vcan0)"), "{log}");
 }
@@ -234,8 +239,7 @@ fn filters(work: &Work) {
     let all = work.frames("all.dump");
     assert_eq!(all.len(), 10, "{all:?}");
     let some = work.frames("some.dump");
-    let wanted =
-        ["5A1#01", "1F0000AA#03", "5AF#R2", "20000080#0000000000000000", "5A2#0A", "124#0B"];
+    let wanted = ["5A1#01", "1F0000AA#03", "5AF#R2", "20000080#0000000000000000", "5A2#0A", "124#0B"];
     assert_eq!(some, wanted);
 }
 
@@ -249,8 +253,11 @@ fn a_controller(work: &Work, told: &str) {
     let commands: Vec<&str> =
         commands.lines().filter(|line| ["S5", "O", "C"].contains(line) || line.starts_with('t')).collect();
     let rest = commands.join(" ").replace("C S5 O", "up").replace("S5 O", "up");
-    assert_eq!(rest.split_whitespace().filter(|c| *c != "C").collect::<Vec<_>>(), 
-        ["up", "t101101", "t666102", "up", "t200103", "up", "t102101"], "{commands:?}\n{told}");
+    assert_eq!(
+        rest.split_whitespace().filter(|c| *c != "C").collect::<Vec<_>>(),
+        ["up", "t101101", "t666102", "up", "t200103", "up", "t102101"],
+        "{commands:?}\n{told}"
+    );
     let sum = work.sum("kern");
     assert!(sum.contains("; 1 times bus-off, 1 restarts, "), "{sum}");
 }

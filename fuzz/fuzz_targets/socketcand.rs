@@ -33,6 +33,7 @@ fuzz_target!(|data: &[u8]| {
                 assert!(!open && reply.starts_with(b"< error "));
                 return;
             }
+            Action::Refused => assert!(open),
             Action::Transmit(frame) => {
                 assert!(open);
                 frame.validate().unwrap();

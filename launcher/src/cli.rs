@@ -88,6 +88,12 @@ pub enum Command {
     /// See, send, generate and replay CAN frames
     #[command(subcommand)]
     Can(CanCommand),
+    /// Read and write Modbus devices, find and identify them
+    #[command(subcommand)]
+    Modbus(crate::commands::modbus::ModbusCommand),
+    /// List serial ports, see and send frames
+    #[command(subcommand)]
+    Serial(crate::commands::serial::SerialCommand),
     /// Control a PLC, read and change its variables
     Plc {
         /// The plc service; not needed when the stack has only one
@@ -132,14 +138,16 @@ pub enum Command {
         /// Recording (MCAP)
         file: PathBuf,
         /// Execute the program again scan by scan and compare
-        #[arg(long, required = true)]
+        #[arg(long, required_unless_present = "as_slave")]
         verify: bool,
         /// Compare this program, instead of the recorded one, against the recorded data
         #[arg(long, value_name = "FILE")]
         program: Vec<PathBuf>,
-        /// The plc service; not needed when the recording has only one
+        /// The plc service or serial line; not needed when the recording has only one
         #[arg(long, value_name = "NAME")]
         service: Option<String>,
+        #[command(flatten)]
+        slave: crate::commands::replay_slave::SlaveArgs,
     },
     /// Find what is wrong with a stack file without starting it
     Check {

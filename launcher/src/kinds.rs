@@ -46,8 +46,7 @@ pub fn accepts<C: DeserializeOwned>(value: &serde_json::Value) -> Result<(), ser
 }
 
 /// Kinds that are named in the documentation of the project but cannot run yet.
-pub const NOT_YET: [&str; 6] =
-    ["serial", "canopen-master", "canopen-slave", "j1939", "modbus-client", "console"];
+pub const NOT_YET: [&str; 2] = ["j1939", "console"];
 
 /// One row of [`KINDS`] from the functions a service crate exports.
 macro_rules! kind {
@@ -78,9 +77,30 @@ macro_rules! service_config {
 }
 
 service_config!(dinrail_can::Config, dinrail_can::topics, dinrail_can::check);
+service_config!(
+    dinrail_canopen::config::MasterConfig,
+    dinrail_canopen::service::master::topics,
+    dinrail_canopen::service::master::check
+);
+service_config!(
+    dinrail_canopen::config::SlaveConfig,
+    dinrail_canopen::service::slave::topics,
+    dinrail_canopen::service::slave::check
+);
 service_config!(dinrail_can_io::Config, dinrail_can_io::topics, dinrail_can_io::check);
 service_config!(dinrail_modbus::Config, dinrail_modbus::topics, dinrail_modbus::check);
+service_config!(
+    dinrail_modbus::client::Config,
+    dinrail_modbus::client::topics,
+    dinrail_modbus::client::check
+);
+service_config!(
+    dinrail_modbus::gateway::Config,
+    dinrail_modbus::gateway::topics,
+    dinrail_modbus::gateway::check
+);
 service_config!(dinrail_plc::Config, dinrail_plc::topics, dinrail_plc::check);
+service_config!(dinrail_serial::Config, dinrail_serial::topics, dinrail_serial::check);
 service_config!(dinrail_recorder::Config, dinrail_recorder::topics, dinrail_recorder::check);
 service_config!(
     dinrail_recorder::replay::Config,
@@ -99,6 +119,20 @@ pub static KINDS: &[Kind] = &[
         dinrail_can_io::run
     ),
     kind!(
+        "canopen-master",
+        "boots and runs a CANopen network, its objects are the process image",
+        docs::CANOPEN_MASTER,
+        dinrail_canopen::config::MasterConfig,
+        dinrail_canopen::service::master::run
+    ),
+    kind!(
+        "canopen-slave",
+        "a CANopen device: its objects are the process image, or simulated",
+        docs::CANOPEN_SLAVE,
+        dinrail_canopen::config::SlaveConfig,
+        dinrail_canopen::service::slave::run
+    ),
+    kind!(
         "plc",
         "a process image with its program, in IEC 61131-3 languages, and routes",
         docs::PLC,
@@ -107,10 +141,31 @@ pub static KINDS: &[Kind] = &[
     ),
     kind!(
         "modbus-server",
-        "serves the process image to Modbus TCP clients",
+        "serves the process image to Modbus clients on TCP and serial lines",
         docs::MODBUS_SERVER,
         dinrail_modbus::Config,
         dinrail_modbus::run
+    ),
+    kind!(
+        "modbus-client",
+        "a Modbus master: units polled into the process image, written from it, asked by jobs",
+        docs::MODBUS_CLIENT,
+        dinrail_modbus::client::Config,
+        dinrail_modbus::client::run
+    ),
+    kind!(
+        "modbus-gateway",
+        "passes requests of Modbus TCP masters on to serial lines",
+        docs::MODBUS_GATEWAY,
+        dinrail_modbus::gateway::Config,
+        dinrail_modbus::gateway::run
+    ),
+    kind!(
+        "serial",
+        "a serial port, RS-232 or RS-485, and its driver",
+        docs::SERIAL,
+        dinrail_serial::Config,
+        dinrail_serial::run
     ),
     kind!(
         "recorder",

@@ -27,9 +27,24 @@ pub static STACKS: &[ReadyStack] = &[
         files: files!("can-to-modbus": "README.md", "main.st", "stack.toml"),
     },
     ReadyStack {
+        name: "canopen-io",
+        about: "a CANopen master, two simulated I/O nodes, a program, Modbus TCP and a recorder",
+        files: files!("canopen-io": "README.md", "io401.eds", "main.st", "stack.toml"),
+    },
+    ReadyStack {
         name: "demo",
         about: "a conveyor's CAN bus, a program, Modbus TCP and a recorder",
         files: files!("demo": "README.md", "conveyor.log", "main.st", "stack.toml"),
+    },
+    ReadyStack {
+        name: "meter-logger",
+        about: "a Modbus master, a simulated energy meter, a program that watches it, and a recorder",
+        files: files!("meter-logger": "README.md", "logger.st", "meter.st", "stack.toml"),
+    },
+    ReadyStack {
+        name: "modbus-gateway",
+        about: "Modbus TCP masters on one side, the units of an RS-485 line on the other",
+        files: files!("modbus-gateway": "README.md", "stack.toml"),
     },
 ];
 

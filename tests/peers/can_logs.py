@@ -29,7 +29,8 @@ def number(channel):
 def row(message):
     stamp = round(message.timestamp * 1e6)
     if message.is_error_frame:
-        return [stamp, number(message.channel) if message.channel is not None else 0, "error"]
+        # Its candump reader does not say where an error frame was.
+        return [stamp, "error"]
     return [
         stamp, number(message.channel), message.arbitration_id, message.is_extended_id, message.is_remote_frame,
         message.is_fd, message.bitrate_switch, message.error_state_indicator, message.dlc,

@@ -3,6 +3,7 @@
 
 pub mod car;
 pub mod modbus;
+pub mod pcap;
 pub mod peers;
 pub mod python;
 pub mod socketcand;

@@ -9,12 +9,15 @@ mod down;
 mod explain;
 mod logs;
 mod map;
+pub mod modbus;
 mod new;
 mod plc;
 mod ps;
 pub mod recordings;
 mod replay;
+pub mod replay_slave;
 mod restart;
+pub mod serial;
 mod status;
 mod top;
 mod trace;
@@ -52,6 +55,8 @@ pub fn run(cli: Cli) -> ExitCode {
             done(logs::run(service.as_deref(), lines, follow, &which, json))
         }
         Command::Restart { service, which } => done(restart::run(&service, &which, json)),
+        Command::Modbus(command) => done(modbus::run(command, json)),
+        Command::Serial(command) => done(serial::run(command, json)),
         Command::Can(command) => can::run(command, json),
         Command::Plc { service, stack, command } => {
             done(plc::run(service.as_deref(), stack.as_deref(), command, json))
@@ -63,6 +68,9 @@ pub fn run(cli: Cli) -> ExitCode {
             trace::scans(&files, cycle, scans, &set, json)
         }
         Command::Trace { .. } => Err(UsageError("give --case, or --cycle and --scans".to_owned()).into()),
+        Command::Replay { ref file, ref service, ref slave, .. } if slave.as_slave => {
+            replay_slave::run(file, service.as_deref(), slave, json)
+        }
         Command::Replay { file, program, service, .. } => {
             let what = replay::Verify { file: &file, program: &program, service: service.as_deref() };
             replay::verify(&what, json)

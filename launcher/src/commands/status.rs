@@ -204,8 +204,10 @@ fn body_text(body: &Value) -> String {
         .map(|(path, value)| (path.clone(), plain(value)))
         .collect();
     let width = plain.iter().map(|(path, _)| path.chars().count()).max().unwrap_or(0);
-    let mut text: String =
-        plain.iter().map(|(path, value)| format!("  {path:width$}  {value}").trim_end().to_owned() + "\n").collect();
+    let mut text: String = plain
+        .iter()
+        .map(|(path, value)| format!("  {path:width$}  {value}").trim_end().to_owned() + "\n")
+        .collect();
     for (path, value) in &fields {
         if let Some(rows) = rows_of(value) {
             text += &format!("  {path}\n{}", list_text(&rows));
@@ -247,7 +249,8 @@ fn list_text(rows: &[Vec<(String, &Value)>]) -> String {
         }
     }
     let cells = |row: &Vec<(String, &Value)>| {
-        let find = |name: &&str| row.iter().find(|(path, _)| path == name).map_or("-".to_owned(), |(_, v)| plain(v));
+        let find =
+            |name: &&str| row.iter().find(|(path, _)| path == name).map_or("-".to_owned(), |(_, v)| plain(v));
         head.iter().map(find).collect::<Vec<String>>()
     };
     let body: Vec<Vec<String>> = rows.iter().take(ROWS_MAX).map(cells).collect();
@@ -291,7 +294,10 @@ mod tests {
         let value: Value = serde_json::from_str(&shown(&snapshot, &names, true)).unwrap();
         assert_eq!((&value["stack"], value["service_list"].as_array().unwrap().len()), (&json!("demo"), 4));
         assert_eq!(value["service_list"][1]["status"]["link"]["tec"], 255);
-        assert_eq!((&value["service_list"][0]["status"], &value["service_list"][2]["status_age_ms"]), (&Value::Null, &json!(0)));
+        assert_eq!(
+            (&value["service_list"][0]["status"], &value["service_list"][2]["status_age_ms"]),
+            (&Value::Null, &json!(0))
+        );
     }
 
     #[test]
@@ -307,7 +313,10 @@ mod tests {
     fn an_unknown_service_is_answered_with_the_nearest() {
         let has = ["rec", "can0", "modbus"];
         let refused = choose(&has, &["modus".to_owned()]).unwrap_err().to_string();
-        assert!(refused.starts_with("this stack has no service 'modus'; did you mean 'modbus'?"), "{refused}");
+        assert!(
+            refused.starts_with("this stack has no service 'modus'; did you mean 'modbus'?"),
+            "{refused}"
+        );
         let far = choose(&has, &["zzzzzz".to_owned()]).unwrap_err().to_string();
         assert!(far.contains("rec, can0, modbus"), "{far}");
         // In the order of the stack, whatever the order asked.

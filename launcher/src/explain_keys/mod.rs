@@ -1,13 +1,19 @@
 //! What every key of a stack file means: one table for `dinrail explain`, the help of error messages and the JSON
 //! schema for editors. A test compares it with the types that read the keys, so neither can have a key alone.
 
+mod canopen;
 mod fields;
 mod gateway;
 mod logic;
+mod modbus_client;
+mod serial;
 
+pub use canopen::{CANOPEN_MASTER, CANOPEN_SLAVE};
 pub use fields::{CAN, CAN_IO};
 pub use gateway::{MODBUS_SERVER, RECORDER, REPLAY};
 pub use logic::PLC;
+pub use modbus_client::{MODBUS_CLIENT, MODBUS_GATEWAY};
+pub use serial::SERIAL;
 
 /// What a key takes.
 #[derive(Debug, Clone, Copy, PartialEq)]

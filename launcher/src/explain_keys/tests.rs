@@ -208,8 +208,20 @@ fn the_documented_defaults_are_those_of_the_types() {
     defaults::<dinrail_modbus::Config>(
         MODBUS_SERVER,
         json!({ "tcp": { "filter": { "mask": "255.0.0.0", "start": "10.0.0.1", "end": "10.0.0.2" } },
+                "identity": { "server_text": "x", "revision": "1" },
                 "watchdog_values": [{ "to": "%MW0", "value": 0 }] }),
     );
+    defaults::<dinrail_modbus::client::Config>(
+        MODBUS_CLIENT,
+        json!({ "unit": [{ "id": 1 }], "read": [{ "unit": 1, "table": "coils", "at": 0, "to": "%IX0.0" }],
+                "write": [{ "unit": 1, "table": "coils", "at": 0, "from": "%QX0.0" }] }),
+    );
+    defaults::<dinrail_modbus::gateway::Config>(
+        MODBUS_GATEWAY,
+        json!({ "port": [{ "serial": "com1" }], "units": [{ "tcp": 1 }],
+                "cache": [{ "unit": 1, "table": "coils", "at": 0, "count": 1 }] }),
+    );
+    defaults::<dinrail_serial::Config>(SERIAL, json!({ "device": "/dev/ttyS0" }));
     defaults::<dinrail_recorder::Config>(RECORDER, json!({}));
     defaults::<dinrail_recorder::replay::Config>(REPLAY, json!({ "file": "x" }));
 }

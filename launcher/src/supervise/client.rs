@@ -2,8 +2,8 @@
 
 use super::control::{Reply, Request};
 use super::state_dir::{self, RunningStack, SOCKET};
-use ipc_types::rail::RailError;
 use ipc_types::Context;
+use ipc_types::rail::RailError;
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
 use std::time::Duration;

@@ -134,20 +134,13 @@ impl<H: Host + 'static> Hub<H> {
         }
     }
 
-    /// Waits until the bus wants its next [`Self::turn`] (paced frames, feed).
+    /// Waits until the bus wants its next [`Self::turn`] (paced frames, feed). May come once too often, never too late.
     pub async fn alarm(&self) -> io::Result<()> {
-        loop {
-            let mut guard = self.alarm.readable().await?;
-            let mut ticks = [0u8; 8];
-            match rustix::io::read(self.alarm.get_ref(), &mut ticks) {
-                Ok(_) => {
-                    self.inner.borrow_mut().alarm_ns = None;
-                    return Ok(());
-                }
-                Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => guard.clear_ready(),
-                Err(e) => return Err(e.into()),
-            }
-        }
+        let mut guard = self.alarm.readable().await?;
+        // The clock rings once and is set anew, so there is nothing to read from it: a read less per frame of a paced bus.
+        guard.clear_ready();
+        self.inner.borrow_mut().alarm_ns = None;
+        Ok(())
     }
 
     /// Waits until the wire could have another frame.
@@ -215,7 +208,10 @@ impl<H: Host + 'static> Hub<H> {
                 // Descriptors exhausted or the like: others must go first.
                 Err(e) => {
                     if let Some(untold) = seldom.failed(ipc_types::clock::mono_ns()) {
-                        tracing::warn!("accepting {} clients: {e} ({untold} more since last told)", dialect.name());
+                        tracing::warn!(
+                            "accepting {} clients: {e} ({untold} more since last told)",
+                            dialect.name()
+                        );
                     }
                     tokio::time::sleep(Duration::from_millis(100)).await;
                 }

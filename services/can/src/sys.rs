@@ -84,8 +84,9 @@ pub fn from_kernel(bytes: &[u8]) -> Option<Frame> {
     Some(frame)
 }
 
-/// Takes what waits in a raw CAN socket, at most [`BATCH`] frames. Never waits: `WouldBlock` when there is nothing.
-pub fn receive<'a>(socket: BorrowedFd<'_>, batch: &'a mut Batch) -> io::Result<&'a [Received]> {
+/// Takes what waits in a raw CAN socket, at most [`BATCH`] messages, and says how many; those that are frames are the
+/// batch's items. Never waits: `WouldBlock` when there is nothing.
+pub fn receive(socket: BorrowedFd<'_>, batch: &mut Batch) -> io::Result<usize> {
     batch.received.clear();
     let mut vectors: [libc::iovec; BATCH] = std::array::from_fn(|i| libc::iovec {
         iov_base: batch.frames[i].as_mut_ptr().cast(),
@@ -121,7 +122,7 @@ pub fn receive<'a>(socket: BorrowedFd<'_>, batch: &'a mut Batch) -> io::Result<&
         let (utc_ns, drops) = control(&header.msg_hdr);
         batch.received.push(Received { frame, own, utc_ns, drops });
     }
-    Ok(&batch.received)
+    Ok(count as usize)
 }
 
 fn control(header: &libc::msghdr) -> (Option<u64>, Option<u32>) {
@@ -224,8 +225,8 @@ mod tests {
         }
         a.send(b"no frame").unwrap();
         let mut batch = Batch::default();
-        let got: Vec<_> =
-            receive(b.as_fd(), &mut batch).unwrap().iter().map(|r| (r.frame, r.own, r.drops)).collect();
+        assert_eq!(receive(b.as_fd(), &mut batch).unwrap(), 5);
+        let got: Vec<_> = batch.items().iter().map(|r| (r.frame, r.own, r.drops)).collect();
         assert_eq!(got, frames.iter().map(|f| (*f, false, None)).collect::<Vec<_>>());
         assert_eq!(receive(b.as_fd(), &mut batch).unwrap_err().kind(), io::ErrorKind::WouldBlock);
     }

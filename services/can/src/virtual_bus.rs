@@ -17,7 +17,9 @@ use crate::protocol::busload::{LoadMeter, Stuffing, bits};
 use crate::protocol::{Frame, cannelloni, slcan, socketcand};
 use crate::txqueue::{Pushed, TxCounters, TxQueue};
 
+mod texts;
 mod wire_side;
+use texts::Texts;
 use wire_side::WireSide;
 pub use wire_side::{STALE_NS, WireCounters};
 
@@ -169,8 +171,9 @@ pub struct VirtualBus {
     rail: TxQueue,
     feed: VecDeque<(Frame, u64)>,
     clients: Vec<Option<Client>>,
-    /// The frame on the wire of a paced bus and when it ends.
-    on_wire: Option<(Frame, Origin, u64)>,
+    connected: usize,
+    /// The frame on the wire of a paced bus, when it ends, and how long it takes.
+    on_wire: Option<(Frame, Origin, u64, u64)>,
     free_at_ns: u64,
     /// Without pace: time up to which the allowed frames are used up (generic cell rate algorithm).
     used_until_ns: u64,
@@ -191,6 +194,7 @@ impl VirtualBus {
             rail: TxQueue::new(settings.tx_queue),
             feed: VecDeque::with_capacity(CLIENT_QUEUE),
             clients: (0..MAX_CLIENTS).map(|_| None).collect(),
+            connected: 0,
             on_wire: None,
             free_at_ns: 0,
             used_until_ns: 0,
@@ -237,6 +241,7 @@ impl VirtualBus {
             self.output_ready |= 1 << number;
         }
         self.clients[number] = Some(client);
+        self.connected += 1;
         Some(number)
     }
 
@@ -244,6 +249,7 @@ impl VirtualBus {
     pub fn disconnect(&mut self, number: usize) -> ClientCounters {
         self.wire_disown(number);
         let gone = self.clients.get_mut(number).and_then(Option::take);
+        self.connected -= usize::from(gone.is_some());
         gone.map(|client| client.counters).unwrap_or_default()
     }
 
@@ -323,12 +329,15 @@ impl VirtualBus {
             return None;
         }
         for _ in 0..TURN_FRAMES {
-            if let Some((frame, origin, end_ns)) = self.on_wire {
+            if let Some((frame, origin, end_ns, wire_ns)) = self.on_wire {
                 if end_ns > now_ns {
                     return Some(end_ns);
                 }
                 self.on_wire = None;
-                self.on_bus(&frame, origin, end_ns, tap);
+                if !frame.is_error() {
+                    self.load.add(end_ns, wire_ns);
+                }
+                self.tell(&frame, origin, end_ns, tap);
             }
             if !self.settings.pace && !self.may_allow(now_ns) {
                 // Not for every single frame: a wake for a quarter of the burst is cheap and still smooth.
@@ -342,7 +351,7 @@ impl VirtualBus {
                 let start_ns = self.free_at_ns.max(arrived_ns);
                 let wire_ns = self.wire_ns(&frame);
                 self.free_at_ns = start_ns + wire_ns;
-                self.on_wire = Some((frame, origin, self.free_at_ns));
+                self.on_wire = Some((frame, origin, self.free_at_ns, wire_ns));
             } else {
                 self.allow(now_ns);
                 self.on_bus(&frame, origin, now_ns, tap);
@@ -402,6 +411,10 @@ impl VirtualBus {
             let wire_ns = self.wire_ns(frame);
             self.load.add(t_ns, wire_ns);
         }
+        self.tell(frame, origin, t_ns, tap);
+    }
+
+    fn tell(&mut self, frame: &Frame, origin: Origin, t_ns: u64, tap: &mut impl Tap) {
         self.counters.frames += 1;
         match origin {
             Origin::Rail => self.counters.from_rail += 1,
@@ -409,6 +422,9 @@ impl VirtualBus {
             Origin::Client(_) | Origin::Wire => {}
         }
         tap.frame(frame, t_ns, origin);
+        if self.connected == 0 {
+            return;
+        }
         let utc_ns = t_ns.saturating_add_signed(self.utc_offset_ns);
         let mut texts = Texts::default();
         for (number, client) in self.clients.iter_mut().enumerate() {
@@ -512,6 +528,10 @@ impl Client {
                 self.hold = None;
                 match session.handle(&command, &settings.name) {
                     socketcand::Action::Transmit(frame) => (Step::More, Some(frame)),
+                    socketcand::Action::Refused => {
+                        self.counters.refused += 1;
+                        (Step::More, None)
+                    }
                     socketcand::Action::Reply(text) => {
                         self.counters.refused += u64::from(text.starts_with(b"< error"));
                         if self.reply(text, settings) && command == socketcand::Command::RawMode {
@@ -560,51 +580,6 @@ impl Client {
             self.out.extend(text);
         }
         fits
-    }
-}
-
-/// The texts of one frame, each written when the first client needs it.
-struct Texts {
-    socketcand: ([u8; socketcand::MAX_TEXT], usize),
-    slcan: ([u8; slcan::MAX_TEXT], usize),
-    slcan_stamped: ([u8; slcan::MAX_TEXT], usize),
-    cannelloni: ([u8; cannelloni::MAX_BYTES], usize),
-}
-
-impl Default for Texts {
-    fn default() -> Self {
-        Self {
-            socketcand: ([0; socketcand::MAX_TEXT], usize::MAX),
-            slcan: ([0; slcan::MAX_TEXT], usize::MAX),
-            slcan_stamped: ([0; slcan::MAX_TEXT], usize::MAX),
-            cannelloni: ([0; cannelloni::MAX_BYTES], usize::MAX),
-        }
-    }
-}
-
-impl Texts {
-    fn socketcand(&mut self, frame: &Frame, utc_ns: u64) -> &[u8] {
-        let (text, len) = &mut self.socketcand;
-        if *len == usize::MAX {
-            *len = socketcand::encode(frame, utc_ns, text);
-        }
-        &text[..*len]
-    }
-
-    fn cannelloni(&mut self, frame: &Frame) -> &[u8] {
-        let (bytes, len) = &mut self.cannelloni;
-        if *len == usize::MAX {
-            *len = cannelloni::encode(frame, bytes);
-        }
-        &bytes[..*len]
-    }
-
-    fn slcan(&mut self, frame: &Frame, stamp_ms: Option<u64>) -> &[u8] {
-        let (text, len) = if stamp_ms.is_some() { &mut self.slcan_stamped } else { &mut self.slcan };
-        if *len == usize::MAX {
-            *len = slcan::encode(frame, stamp_ms, text);
-        }
-        &text[..*len]
     }
 }
 

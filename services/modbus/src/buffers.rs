@@ -287,7 +287,9 @@ mod tests {
         let mut marker = [0; 64];
         marker[20..26].copy_from_slice(&[1, 2, 3, 4, 5, 6]);
         marker[40..46].copy_from_slice(&[2, 0, 0xB8, 0x01, 0x84, 0x12]);
-        let memory = |marker| Memory { marker, input: &[9, 8], ..Memory::default() };
+        fn memory(marker: &[u8]) -> Memory<'_> {
+            Memory { marker, input: &[9, 8], ..Memory::default() }
+        }
         for (access, file, record, count, good) in [
             (Access::Read, 4, 0, 3, true),
             (Access::Write, 4, 2, 1, true),

@@ -137,7 +137,7 @@ impl Line {
         self.flags |= chunk.flags;
         match self.mode {
             Mode::Rtu => self.rtu(chunk.flags & serial_flag::END != 0, bytes, image, send),
-            Mode::Ascii => self.ascii(bytes, image, send),
+            Mode::Ascii => self.ascii(chunk.flags, bytes, image, send),
         }
     }
 
@@ -203,8 +203,12 @@ impl Line {
         }
     }
 
-    fn ascii(&mut self, bytes: &[u8], image: &mut dyn Image, send: &mut Send<'_>) {
+    fn ascii(&mut self, flags: u32, bytes: &[u8], image: &mut dyn Image, send: &mut Send<'_>) {
         for &character in bytes {
+            if character == b':' {
+                // Damage before the beginning of a frame is not its own.
+                self.flags = flags;
+            }
             match self.receiver.push(character) {
                 Received::Nothing => {}
                 Received::Broken => self.broken(&FrameError::End),

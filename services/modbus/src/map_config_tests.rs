@@ -27,7 +27,7 @@ fn the_key_is_a_name_or_tables() {
     let bad = |json| serde_json::from_str::<MapConfig>(json).unwrap_err().to_string();
     assert_snapshot!(bad("\"mine\""), @r#"there is no map 'mine': write "dinrail", "openplc", or [[service.map]] tables at line 1 column 6"#);
     assert_snapshot!(bad("7"), @r#"invalid type: integer `7`, expected "dinrail", "openplc", or [[service.map]] tables at line 1 column 1"#);
-    assert_snapshot!(bad(r#"[{ "table": "holding", "at": 0, "count": 1, "aera": "%MW0" }]"#), @"unknown field `aera`, expected one of `table`, `at`, `count`, `area`, `word_order`, `swap_bytes`, `own` at line 1 column 50");
+    assert_snapshot!(bad(r#"[{ "table": "holding", "at": 0, "count": 1, "aera": "%MW0" }]"#), @"unknown field `aera`, expected one of `table`, `at`, `count`, `area`, `word_order`, `swap_bytes`, `order`, `own`, `read_only` at line 1 column 50");
 }
 
 #[test]
@@ -43,7 +43,11 @@ fn every_mistake_names_the_table_and_the_remedy() {
     assert_snapshot!(table(r#""table": "input", "at": 1, "count": 2, "area": "%IX0.9""#), @"map table 2: `%IX0.9`: a byte has the bits 0 to 7; bit 9 of byte 0 is %IX1.1");
     assert_snapshot!(table(r#""table": "input", "at": 1, "count": 2, "area": "%IW0", "word_order": "high_first""#), @"map table 2: word_order needs values of 32 or 64 bits; write area as %xD or %xL, got %IW0");
     assert_snapshot!(table(r#""table": "input", "at": 1, "count": 3, "area": "%ID0""#), @"map table 2: count 3 splits a value; %xD needs a multiple of 2, %xL of 4");
-    assert_snapshot!(table(r#""table": "coils", "at": 1, "count": 3, "area": "%QX0.0", "swap_bytes": true"#), @"map table 2: swap_bytes is for registers, coils shows single bits");
+    assert_snapshot!(table(r#""table": "coils", "at": 1, "count": 3, "area": "%QX0.0", "swap_bytes": true"#), @"map table 2: order and swap_bytes are for registers, coils shows single bits");
+    assert_snapshot!(table(r#""table": "holding", "at": 1, "count": 2, "area": "%QD0", "order": "AB""#), @"map table 2: order AB is for values of 16 bits, but %QD0 has others; write AB or BA for %xW, ABCD, CDAB, BADC or DCBA for %xD and %xL");
+    assert_snapshot!(table(r#""table": "holding", "at": 1, "count": 2, "area": "%QW0", "order": "CDAB""#), @"map table 2: order CDAB is for values of 32 or 64 bits, but %QW0 has others; write AB or BA for %xW, ABCD, CDAB, BADC or DCBA for %xD and %xL");
+    assert_snapshot!(table(r#""table": "holding", "at": 1, "count": 2, "area": "%QD0", "order": "CDAB", "swap_bytes": true"#), @"map table 2: order says what word_order and swap_bytes say; keep one of them");
+    assert_snapshot!(table(r#""table": "holding", "at": 1, "count": 2, "area": "%IW0", "own": true, "read_only": true"#), @"map table 2: own = true lets clients write what read_only = true forbids; keep one of them");
     assert_snapshot!(table(r#""table": "holding", "at": 1, "count": 3, "area": "%QW0", "own": true"#), @"map table 2: own = true is for %I in coils or holding_registers, which clients can write; got %QW0 in holding_registers");
     assert_snapshot!(table(r#""table": "input", "at": 1, "count": 3, "area": "%IW0", "own": true"#), @"map table 2: own = true is for %I in coils or holding_registers, which clients can write; got %IW0 in input_registers");
     assert_snapshot!(table(r#""table": "coils", "at": 1, "count": 3, "area": "%IX0.0", "own": true"#), @"map table 2: bits of %I owned by the server are owned by whole bytes; begin at bit 0 and give a multiple of 8");

@@ -295,3 +295,39 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn orders_of_bytes_and_read_only_windows() {
+    use crate::map_config::ByteOrder;
+    // DWORD 0A0B0C0Dh, WORD 0A0Bh, as they lie in memory.
+    let marker = [0x0D, 0x0C, 0x0B, 0x0A, 0, 0, 0, 0];
+    for (order, area, count, wire) in [
+        (ByteOrder::Abcd, "%MD0", 2, &[0x0A, 0x0B, 0x0C, 0x0D][..]),
+        (ByteOrder::Cdab, "%MD0", 2, &[0x0C, 0x0D, 0x0A, 0x0B]),
+        (ByteOrder::Badc, "%MD0", 2, &[0x0B, 0x0A, 0x0D, 0x0C]),
+        (ByteOrder::Dcba, "%MD0", 2, &[0x0D, 0x0C, 0x0B, 0x0A]),
+        (ByteOrder::Ab, "%MW0", 1, &[0x0C, 0x0D]),
+        (ByteOrder::Ba, "%MW0", 1, &[0x0D, 0x0C]),
+    ] {
+        let map = map(&[MapEntry { order: Some(order), ..entry(Table::HoldingRegisters, 0, count, area) }]);
+        let mut out = vec![0; wire.len()];
+        let memory = Memory { marker: &marker, ..Memory::default() };
+        map.read_words(&memory, Table::HoldingRegisters, 0, &mut out).unwrap();
+        assert_eq!(out, wire, "{order:?}");
+        // What is written that way is the same value in memory.
+        let mut set = WriteSet::default();
+        map.plan(&Write::Registers { address: 0, values: wire }, &mut set).unwrap();
+        let mut written = [0; 8];
+        for run in set.runs() {
+            assert!(run.op().apply(&mut written));
+        }
+        assert_eq!(written[..wire.len()], marker[..wire.len()], "{order:?}");
+    }
+    let map = map(&[
+        MapEntry { read_only: true, ..entry(Table::HoldingRegisters, 0, 2, "%MW0") },
+        entry(Table::HoldingRegisters, 2, 2, "%MW2"),
+    ]);
+    let check = |access, at, n| map.check(access, Table::HoldingRegisters, at, n).is_ok();
+    assert!(check(Access::Read, 0, 4) && check(Access::Write, 2, 2));
+    assert!(!check(Access::Write, 0, 1) && !check(Access::Write, 1, 2));
+}

@@ -1,7 +1,9 @@
 use super::*;
 use crate::map_config::{MapConfig, Preset};
 use crate::protocol::pdu::MAX_PDU;
-use crate::server::answer;
+use crate::identity::Identity;
+use crate::line_state::LineState;
+use crate::server::{Unit, answer};
 use crate::testing::{hex, to_hex};
 use dinrail_iec::Addressing;
 use ipc_types::image_write::{self, Op};
@@ -106,7 +108,9 @@ impl Bench {
     fn ask(&mut self, pdu: &str) -> String {
         let mut out = [0; MAX_PDU];
         self.image.begin();
-        let outcome = answer(&hex(pdu), &mut self.image, &mut out);
+        let (mut line, identity) = (LineState::default(), Identity::default());
+        let mut unit = Unit { line: &mut line, identity: &identity };
+        let outcome = answer(&hex(pdu), &mut unit, &mut self.image, &mut out);
         to_hex(&out[..outcome.len])
     }
 

@@ -27,7 +27,7 @@ pub const LISTENER: &str = "tcp";
 /// Name of the inherited listener of RTU over TCP.
 pub const RTU_LISTENER: &str = "rtu_over_tcp";
 /// Clients listed in a status, so that it stays below its limit of 16 KiB.
-pub const MAX_LISTED_CLIENTS: usize = 48;
+pub const MAX_LISTED_CLIENTS: usize = 40;
 
 /// Why the service ended.
 #[derive(Debug, thiserror::Error)]

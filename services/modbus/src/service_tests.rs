@@ -1,5 +1,16 @@
+use super::status::{LineStatus, RtuOverTcpStatus, StatusBody};
 use super::*;
+use crate::Config;
+use crate::line::LineCounters;
+use crate::process_image::WriteCounters;
+use crate::tcp::{ClientInfo, Counters};
+use crate::watchdog::WatchdogState;
 use insta::assert_snapshot;
+use ipc_types::payload::PlcState;
+use ipc_types::port::ReadCounters;
+use ipc_types::topic::TopicKind;
+use ipc_types::wiring::{Area, Neighbours};
+use ipc_types::{Finding, Stack, Wiring};
 
 fn config(json: &str) -> Config {
     serde_json::from_str(json).unwrap()
@@ -58,10 +69,13 @@ fn wiring_of_the_default() {
     );
     assert_eq!(wiring.writes, [("plc/writes".to_owned(), "plc".to_owned())]);
     assert_eq!(wiring.plc.as_deref(), Some("plc"));
-    assert!(wiring.topics.is_empty() && wiring.inputs.is_empty());
+    let kinds: Vec<_> = wiring.topics.iter().map(|topic| topic.kind).collect();
+    assert_eq!(kinds, [TopicKind::Jobs, TopicKind::Results]);
+    assert!(wiring.inputs.is_empty());
     assert_eq!(wiring.listeners.len(), 1);
     assert_eq!(wiring.listeners[0].address.to_string(), "0.0.0.0:502");
-    assert!(topics(&config(r#"{ "enable": false }"#), &neighbours(&["plc"])).listeners.is_empty());
+    // Open all the same: it may be switched on while it runs.
+    assert_eq!(topics(&config(r#"{ "enable": false }"#), &neighbours(&["plc"])).listeners.len(), 1);
     assert!(topics(&Config::default(), &neighbours(&["a", "b"])).plc.is_none());
     assert_eq!(topics(&config(r#"{ "plc": "b" }"#), &neighbours(&["a", "b"])).plc.as_deref(), Some("b"));
 }
@@ -85,8 +99,27 @@ fn owned_inputs_are_declared_with_room_for_their_message() {
     );
     let shown: Vec<_> = wiring.outputs.iter().map(|r| (r.area, r.byte, r.bytes, r.label.as_str())).collect();
     assert_eq!(shown, [(Area::Output, 1, 3, "coils 20-29")]);
-    assert_eq!(wiring.topics.len(), 1);
+    assert_eq!(wiring.topics.len(), 3);
     assert_eq!(wiring.topics[0].max_tail, 8196);
+}
+
+#[test]
+fn wiring_of_lines_and_the_list_of_clients() {
+    let config = config(
+        r#"{ "serial": [ { "port": "com1" }, { "port": "com2", "mode": "ascii", "unit": [1, 2] } ],
+             "rtu_over_tcp": { "port": 4001, "max_connections": 3 }, "clients_to": "%IB100",
+             "map": [ { "table": "holding", "at": 0, "count": 2, "area": "%IW60", "own": true } ] }"#,
+    );
+    let wiring = topics(&config, &neighbours(&["plc"]));
+    let reads: Vec<_> = wiring.reads.iter().map(|r| (r.topic.as_str(), r.wake, r.key.as_str())).collect();
+    assert_eq!(
+        reads,
+        [("plc/image", false, "plc"), ("com1/rx", true, "serial[0].port"), ("com2/rx", true, "serial[1].port")]
+    );
+    assert_eq!(wiring.writes[2], ("com2/tx".to_owned(), "serial[1].port".to_owned()));
+    assert_eq!(wiring.listeners.iter().map(|l| l.key.as_str()).collect::<Vec<_>>(), ["rtu_over_tcp.port"]);
+    let ranges: Vec<_> = wiring.inputs.iter().map(|r| (r.byte, r.bytes, r.key.as_str())).collect();
+    assert_eq!(ranges, [(120, 4, "map[0].area"), (100, 20, "clients_to")]);
 }
 
 #[test]
@@ -143,6 +176,16 @@ fn findings_name_key_mistake_and_remedy() {
             &one,
         ),
     ];
+    let wrong = [
+        r#""serial": [ { "port": "com1", "unit": [5, 5, 248] }, { "port": "com1", "answer_within": "0" } ]"#,
+        r#""unit": [ { "id": 0, "map": "dinrail" }, { "id": 3, "map": "dinrail" }, { "id": 3, "map": "openplc" } ]"#,
+        r#""rights": [ { "peer": "com7", "allow": "read" } ]"#,
+        r#""identity": { "extended": [ { "id": 1, "value": "" } ] }"#,
+        r#""clients_to": "%IB4090""#,
+        r#""file": [ { "number": 1, "area": "%MW3000", "records": 1 } ]"#,
+    ]
+    .map(|keys| format!(r#"{{ "tcp": {{ "address": "127.0.0.1" }}, {keys} }}"#));
+    let cases = cases.iter().copied().chain(wrong.iter().map(|json| (json.as_str(), &one[..])));
     let mut text = String::new();
     for (json, plcs) in cases {
         let findings = check_it(&config(json), &stack(plcs));
@@ -169,6 +212,16 @@ Error write_watchdog: the watchdog has nothing to write -> add watchdog_values =
 Error watchdog_values: values without write_watchdog -> set write_watchdog, e.g. "2s", or remove the values
 Error watchdog_values[0]: watchdog value 1: 256 does not fit %QB0, which takes -128 to 255 -> correct or remove the value
 Error write_watchdog: write_watchdog = 50ms is shorter than it is looked at -> set at least "100ms", and twice the clients' period
+Error serial[0].unit: unit 248 is no address of a device -> units are 1 to 247; 0 is the broadcast, 248 to 255 are reserved
+Error serial[0].unit: unit 5 stands there twice -> remove one
+Error serial[1].port: 'com1' is served twice -> give the one line all units: unit = [1, 2]
+Error serial[1].answer_within: no answer could be in time -> leave it out (1s)
+Error unit[0].id: unit 0 is no address of a device -> units are 1 to 247; 0 is the broadcast, 248 to 255 are reserved
+Error unit[2].id: unit 3 has two maps -> remove one [[service.unit]] table
+Error rights[0]: rights 1: 'com7' is no IP address, no network like 192.168.1.0/24 and no serial port of this server -> see the page on the Modbus server for what a [[service.rights]] table takes
+Error identity: identity.extended 1: id 1 is not 128 to 255; lower ones belong to the named objects -> shorten or correct it
+Error clients_to: the list of clients reaches byte 4140 of %I, which has 4096 -> take an earlier place, lower max_connections, or raise input_bytes of the plc service
+Error file[0]: file 1: it reaches byte 6002 of %M, which has 4096; make it smaller or raise the size of %M in the plc service -> see the page on the Modbus server for files and queues
 "#);
 }
 
@@ -202,7 +255,13 @@ fn the_largest_status_fits_its_topic() {
         last_unit: 255,
         last_function: 255,
     };
+    let counters = LineCounters { bus_messages: u64::MAX, by_exception: [u64::MAX; 12], ..LineCounters::default() };
+    let line = || LineStatus { port: "a_long_name_of_a_serial_port", counters: &counters, rail: ReadCounters::default() };
+    let lines: Vec<_> = (0..crate::config::MAX_LINES).map(|_| line()).collect();
     let body = StatusBody {
+        enabled: false,
+        rtu_over_tcp: Some(RtuOverTcpStatus { listen: None, counters: Counters::default() }),
+        serial: &lines,
         listen: Some("[2001:db8:1111:2222:3333:4444:5555:6666]:65535".parse().unwrap()),
         serving: false,
         plc_state: Some(PlcState::Starting),

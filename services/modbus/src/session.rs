@@ -63,6 +63,8 @@ pub enum Next {
 /// The state of one connection.
 pub struct Session {
     framing: Framing,
+    /// RTU over TCP: nothing came for so long that what was received is all there is.
+    silent: bool,
     received: Box<[u8]>,
     start: usize,
     end: usize,
@@ -83,6 +85,7 @@ impl Session {
     pub fn new(framing: Framing) -> Self {
         Self {
             framing,
+            silent: false,
             received: vec![0; BUFFER].into_boxed_slice(),
             start: 0,
             end: 0,
@@ -106,6 +109,7 @@ impl Session {
 
     /// Says that `n` bytes were put into [`Session::space`].
     pub fn received(&mut self, n: usize) {
+        self.silent = false;
         self.end = (self.end + n).min(BUFFER);
     }
 
@@ -173,7 +177,7 @@ impl Session {
         let mut left = MAX_BATCH;
         loop {
             let bytes = &self.received[self.start..self.end];
-            let (skipped, len) = match stream::find(bytes, |unit| device.serves(unit)) {
+            let (skipped, len) = match stream::find(bytes, self.silent, |unit| device.serves(unit)) {
                 Found::Nothing { skip } => {
                     self.start += skip;
                     self.counts.noise += skip as u64;
@@ -207,13 +211,10 @@ impl Session {
         self.framing == Framing::Rtu && self.start < self.end
     }
 
-    /// The stream was silent for so long that what was begun is no frame: drops its first byte, so that
-    /// [`Session::process`] looks behind it.
+    /// The stream was silent for so long that what was begun will not go on: [`Session::process`] makes of it what it
+    /// can and drops the rest.
     pub fn silence(&mut self) {
-        if self.is_waiting() {
-            self.start += 1;
-            self.counts.noise += 1;
-        }
+        self.silent = self.is_waiting();
     }
 
     fn count(&mut self, unit: u8, function: u8, served: Served) {

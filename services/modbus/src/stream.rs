@@ -1,8 +1,8 @@
 //! RTU frames in a stream of bytes, which has no silence between frames.
 //!
 //! A frame is what its function code says is as long as it is and whose CRC is right. What is neither is noise and
-//! skipped byte by byte, except that a frame that begins with a unit of ours and is not whole yet is waited for; the
-//! caller ends that wait after a silence. Frames of other units, requests and answers, are recognized whole, so that
+//! skipped byte by byte, except that a frame that begins with a unit of ours and is not whole yet is waited for, until
+//! the caller says that the stream fell silent: then what came is a frame if its CRC is right. Frames of other units, requests and answers, are recognized whole, so that
 //! nothing inside of them is taken for a request to us.
 
 use crate::protocol::rtu::{self, RequestLength};
@@ -16,31 +16,31 @@ pub enum Found {
     Nothing { skip: usize },
 }
 
-/// Looks for the first frame. `ours`: whether a unit is served here (broadcast too).
-pub fn find(bytes: &[u8], ours: impl Fn(u8) -> bool) -> Found {
+/// Looks for the first frame. `ours`: whether a unit is served here (broadcast too). `silent`: nothing more came for
+/// so long that nothing will.
+pub fn find(bytes: &[u8], silent: bool, ours: impl Fn(u8) -> bool) -> Found {
     for skip in 0..bytes.len() {
         let rest = &bytes[skip..];
         let Some(&unit) = rest.first() else { break };
         let whole = |len: usize| rest.get(..len).is_some_and(rtu::is_frame);
-        // Frames of unknown length are one read; so are echo tests with much data.
-        let all = rest.len() <= rtu::MAX_ADU && rtu::is_frame(rest);
-        match rtu::request_length(rest) {
-            RequestLength::Bytes(len) if whole(len) => return Found::Frame { skip, len },
-            _ if all => return Found::Frame { skip, len: rest.len() },
-            _ if ours(unit) => {}
-            _ => {
-                if let Some(len) = rtu::response_length(rest).filter(|len| whole(*len)) {
-                    return Found::Frame { skip, len };
-                }
-                continue;
-            }
+        let length = rtu::request_length(rest);
+        if let RequestLength::Bytes(len) = length
+            && whole(len)
+        {
+            return Found::Frame { skip, len };
         }
-        match rtu::request_length(rest) {
-            RequestLength::Bytes(len) if len <= rtu::MAX_ADU && rest.len() < len => {
+        // A frame of unknown length, or of a wrong one, is what came at once.
+        let open = matches!(length, RequestLength::Bytes(len) if rest.len() < len && len <= rtu::MAX_ADU)
+            || length == RequestLength::More;
+        if (silent || !open) && rest.len() <= rtu::MAX_ADU && rtu::is_frame(rest) {
+            return Found::Frame { skip, len: rest.len() };
+        }
+        if ours(unit) {
+            if open && !silent {
                 return Found::Nothing { skip };
             }
-            RequestLength::More => return Found::Nothing { skip },
-            _ => {}
+        } else if let Some(len) = rtu::response_length(rest).filter(|len| whole(*len)) {
+            return Found::Frame { skip, len };
         }
     }
     Found::Nothing { skip: bytes.len() }
@@ -76,7 +76,7 @@ mod tests {
             let bytes = [&noise[..], &good].concat();
             let mut at = 0;
             loop {
-                match find(&bytes[at..], ours) {
+                match find(&bytes[at..], false, ours) {
                     Found::Frame { skip, len } if bytes[at + skip] == 5 => {
                         assert_eq!(bytes[at + skip..at + skip + len], good, "{noise:02X?}");
                         break;
@@ -92,22 +92,27 @@ mod tests {
     fn a_begun_frame_is_waited_for_and_an_impossible_one_is_not() {
         let long = frame(5, "10 0000 0002 04 00010002");
         for cut in 1..long.len() {
-            assert_eq!(find(&long[..cut], ours), Found::Nothing { skip: 0 }, "{cut}");
+            assert_eq!(find(&long[..cut], false, ours), Found::Nothing { skip: 0 }, "{cut}");
         }
-        assert_eq!(find(&long, ours), Found::Frame { skip: 0, len: long.len() });
-        assert_eq!(find(&[5, 3, 0, 0, 0, 1, 0xAA, 0xAA], ours), Found::Nothing { skip: 8 });
-        assert_eq!(find(&[], ours), Found::Nothing { skip: 0 });
+        assert_eq!(find(&long, false, ours), Found::Frame { skip: 0, len: long.len() });
+        assert_eq!(find(&[5, 3, 9, 9, 9, 9, 0xAA, 0xAA], false, ours), Found::Nothing { skip: 8 });
+        // Silence ends every wait, and makes a frame of what has a CRC.
+        assert_eq!(find(&long[..6], true, ours), Found::Nothing { skip: 6 });
+        let short = frame(5, "03 0000 00");
+        assert_eq!(find(&short, false, ours), Found::Nothing { skip: 0 });
+        assert_eq!(find(&short, true, ours), Found::Frame { skip: 0, len: short.len() });
+        assert_eq!(find(&[], false, ours), Found::Nothing { skip: 0 });
         // Codes without a known length: one read is one frame.
         for pdu in ["63 01 02 03", "08 0000 0102 0304", "2B 0D 00", "09", "83 02"] {
             let bytes = frame(5, pdu);
-            assert_eq!(find(&bytes, ours), Found::Frame { skip: 0, len: bytes.len() }, "{pdu}");
+            assert_eq!(find(&bytes, false, ours), Found::Frame { skip: 0, len: bytes.len() }, "{pdu}");
         }
     }
 
     proptest! {
         #[test]
         fn any_bytes_never_panic_and_progress_is_made(bytes in proptest::collection::vec(0_u8..30, 0..700)) {
-            match find(&bytes, ours) {
+            match find(&bytes, false, ours) {
                 Found::Frame { skip, len } => prop_assert!(rtu::is_frame(&bytes[skip..skip + len])),
                 // What is left is the beginning of a frame.
                 Found::Nothing { skip } => prop_assert!(bytes.len() - skip < rtu::MAX_ADU),

@@ -1,7 +1,9 @@
 //! Real TCP on the loopback interface.
 
 use super::*;
-use crate::testing::{MemoryImage, hex};
+use crate::admission::Filter;
+use crate::testing::{MemoryImage, hex, matrix, tcp_device, to_hex};
+use ipc_types::net::IpFilter;
 use std::future::Future;
 use std::net::Ipv4Addr;
 use tokio::io::AsyncWriteExt;
@@ -21,7 +23,8 @@ fn with_server<F: Future<Output = ()>>(options: Options, test: impl FnOnce(TestH
     LocalSet::new().block_on(&runtime, async {
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
         let address = listener.local_addr().unwrap();
-        let hub = Hub::new(MemoryImage::new(10000), options);
+        let image = Rc::new(RefCell::new(MemoryImage::new(10000)));
+        let hub = Hub::new(image, tcp_device(), options);
         tokio::task::spawn_local(hub.clone().accept(listener));
         timeout(LONG, test(hub, address)).await.expect("the test hangs");
     });
@@ -57,56 +60,20 @@ async fn until(condition: impl Fn() -> bool) {
     }
 }
 
-/// The requests whose answers differ between public servers, with what V1.1b3 asks for. `{124}` stands for so
-/// many registers of zeros.
-const MATRIX: &[(&str, &str)] = &[
-    ("03 0000 0002", "03 04 0000 0000"),
-    ("01 0000 0000", "81 03"),
-    ("01 0000 07D1", "81 03"),
-    ("03 0000 0000", "83 03"),
-    ("03 0000 007E", "83 03"),
-    ("03 FFFF 0002", "83 02"),
-    ("05 0000 1234", "85 03"),
-    ("0F 0000 0064 01 FF", "8F 03"),
-    ("0F 0000 0001 02 FFFF", "8F 03"),
-    ("10 0000 0002 02 0001", "90 03"),
-    ("10 0000 007C F8 {124}", "90 03"),
-    ("03 0000 0002 00", "83 03"),
-    ("03 0000 00", "83 03"),
-    // Public codes that this server does not have yet: exception 01.
-    ("07", "87 01"),
-    ("08 0000 A537", "88 01"),
-    ("0B", "8B 01"),
-    ("0C", "8C 01"),
-    ("11", "91 01"),
-    ("14 07 06 0001 0000 0002", "94 01"),
-    ("16 0004 00F2 0025", "16 0004 00F2 0025"),
-    ("17 0003 0006 000E 0003 06 00FF00FF00FF", "17 0C 0000 0005 0000 0000 0000 0000"),
-    ("18 0000", "98 01"),
-    ("2B 0E 01 00", "AB 01"),
-    ("2B 0E 09 00", "AB 01"),
-    ("2B 0D 00", "AB 01"),
-    ("64 01", "E4 01"),
-    ("09", "89 01"),
-    ("83 02", "83 01"),
-    ("00", "80 01"),
-];
-
 #[test]
 fn the_matrix_of_disagreements_is_answered_as_the_specification_says() {
-    with_server(Options { max_connections: 64, ..Options::default() }, |hub, address| async move {
-        // The mask write sets the low byte of register 4 to 5, which function 23 reads back.
-        hub.with_backend(|image| image.holding[4] = 0);
-        for (request, response) in MATRIX {
-            let request = request.replace("{124}", &"0000".repeat(124));
+    for (request, response) in matrix() {
+        with_server(Options::default(), |_, address| async move {
             let mut stream = TcpStream::connect(address).await.unwrap();
             // Each is followed by a good request, which must be answered too.
-            stream.write_all(&frame(1, 1, &request)).await.unwrap();
-            assert_eq!(read_answer(&mut stream).await.unwrap(), frame(1, 1, response), "{request}");
+            stream.write_all(&frame(1, 1, &to_hex(&request))).await.unwrap();
+            let expected = frame(1, 1, &to_hex(&response));
+            assert_eq!(read_answer(&mut stream).await.unwrap(), expected, "{request:02X?}");
             stream.write_all(&frame(2, 1, "03 0000 0001")).await.unwrap();
-            assert_eq!(read_answer(&mut stream).await.unwrap(), frame(2, 1, "03 02 0000"), "after {request}");
-        }
-    });
+            let expected = frame(2, 1, "03 02 0000");
+            assert_eq!(read_answer(&mut stream).await.unwrap(), expected, "after {request:02X?}");
+        });
+    }
 }
 
 #[test]
@@ -217,8 +184,9 @@ fn two_hundred_clients_at_once() {
     });
 }
 
-fn filter(start: &str, end: &str) -> IpFilter {
-    IpFilter { mask: Ipv4Addr::UNSPECIFIED, start: start.parse().unwrap(), end: end.parse().unwrap() }
+fn filter(start: &str, end: &str) -> Admission {
+    let (mask, start, end) = (Ipv4Addr::UNSPECIFIED, start.parse().unwrap(), end.parse().unwrap());
+    Admission::new(Some(&Filter::One(IpFilter { mask, start, end })))
 }
 
 #[test]
@@ -293,7 +261,7 @@ fn nobody_makes_room_who_is_not_idle() {
 #[test]
 fn addresses_outside_the_filter_are_closed_before_a_byte_is_read() {
     // Loopback is always allowed, so the peer address is given to `admit` by hand.
-    let options = Options { filter: Some(filter("10.0.0.1", "10.0.0.9")), ..Options::default() };
+    let options = Options { filter: filter("10.0.0.1", "10.0.0.9"), ..Options::default() };
     with_server(options, |hub, _| async move {
         for (peer, allowed) in
             [("10.0.0.1:1", true), ("10.0.0.9:1", true), ("10.0.0.10:1", false), ("[fe80::1]:1", false)]
@@ -385,13 +353,32 @@ fn happenings_are_sentences() {
     .concat();
     insta::assert_snapshot!(text, @r#"
 Modbus client 192.168.1.20:50000 connected
-Modbus client 192.168.1.20:50000 refused: its address is outside tcp.filter
-Modbus client 192.168.1.20:50000 refused: tcp.max_connections are in use
+Modbus client 192.168.1.20:50000 refused: the filter does not admit its address
+Modbus client 192.168.1.20:50000 refused: max_connections are in use
 Modbus client 192.168.1.20:50000 refused: the server is switched off
 Modbus client 192.168.1.20:50000 left: it closed the connection; 7 requests, 1 exceptions
 Modbus client 192.168.1.20:50000 left: it sent a header with an impossible length; 0 requests, 0 exceptions
 Modbus client 192.168.1.20:50000 left: it did not take its answers; 0 requests, 0 exceptions
 "#);
+}
+
+#[test]
+fn rtu_frames_on_a_stream_and_noise_that_never_ends() {
+    let options = Options { framing: Framing::Rtu, ..Options::default() };
+    with_server(options, |hub, address| async move {
+        let good = hex("01030000000184 0A");
+        let mut stream = TcpStream::connect(address).await.unwrap();
+        stream.write_all(&good).await.unwrap();
+        let mut answer = [0; 7];
+        stream.read_exact(&mut answer).await.unwrap();
+        assert_eq!(answer, *hex("0103020000B844"));
+        // The beginning of a frame that never comes whole.
+        stream.write_all(&hex("01 10 0000 0002 04 00")).await.unwrap();
+        until(|| hub.counters().noise >= 8).await;
+        stream.write_all(&good).await.unwrap();
+        stream.read_exact(&mut answer).await.unwrap();
+        assert_eq!(answer, *hex("0103020000B844"));
+    });
 }
 
 #[test]

@@ -5,12 +5,15 @@ use dinrail_iec::Addressing;
 use dinrail_modbus::config::OnStop;
 use dinrail_modbus::map_config::MapConfig;
 use dinrail_modbus::process_image::{NotQueued, ProcessImage, Rail};
-use dinrail_modbus::protocol::mbap;
-use dinrail_modbus::session::{Next, Session, UnitRule};
+use dinrail_modbus::protocol::{ascii, mbap, rtu};
+use dinrail_modbus::device::{Device, Shared};
+use dinrail_modbus::line::{Line, Mode};
+use dinrail_modbus::rights::Peer;
+use dinrail_modbus::session::{Next, Session};
 use dinrail_modbus::tcp::Backend;
 use dinrail_modbus::view::View;
 use ipc_types::image_write::Builder;
-use ipc_types::payload::{Image, PlcState};
+use ipc_types::payload::{Image, PlcState, SerialChunk, serial_flag};
 use ipc_types::wiring::AreaSizes;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -86,7 +89,7 @@ fn requests_allocate_nothing() {
     let map = map.build(AreaSizes::MAX, Addressing::Element).unwrap();
     let plc = Plc { now_ns: 0, seq: 0, tail: vec![0; 3 * 4096] };
     let mut image = ProcessImage::new(plc, View::new(1, 1, 200_000_000), map, OnStop::Exception, None);
-    let requests: [&[u8]; 12] = [
+    let requests: [&[u8]; 20] = [
         &[3, 0, 1, 0, 100],
         &[4, 0, 0, 0, 10],
         &[1, 0, 3, 7, 0],
@@ -99,6 +102,14 @@ fn requests_allocate_nothing() {
         &[23, 0, 0, 0, 20, 0, 3, 0, 1, 2, 9, 9],
         &[3, 0xFF, 0xFF, 0, 2],
         &[43, 14, 1, 0],
+        &[7],
+        &[8, 0, 0, 1, 2],
+        &[11],
+        &[12],
+        &[17],
+        &[20, 7, 6, 0, 1, 0, 0, 0, 2],
+        &[21, 9, 6, 0, 1, 0, 0, 0, 1, 1, 2],
+        &[24, 0, 0],
     ];
     let stream: Vec<u8> = requests
         .iter()
@@ -108,20 +119,57 @@ fn requests_allocate_nothing() {
             frame[..len].to_vec()
         })
         .collect();
-    let units = UnitRule::only(&[1]);
-    let mut session = Session::new();
+    let mut device = Device::tcp(Some(&[1]), &[], Shared::open());
+    let peer = Peer::Ip(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST));
+    let mut session = Session::default();
     let mut answers = 0;
     let before = ALLOCATIONS.get();
     for _ in 0..1000 {
         session.space()[..stream.len()].copy_from_slice(&stream);
         session.received(stream.len());
         image.begin();
-        assert_eq!(session.process(&units, &mut image), Next::Read);
-        answers += session.output().len();
-        session.sent(session.output().len());
+        // Sixteen at a time.
+        for next in [Next::Again, Next::Read] {
+            assert_eq!(session.process(&mut device, &peer, &mut image), next);
+            answers += session.output().len();
+            session.sent(session.output().len());
+        }
     }
     assert_eq!(ALLOCATIONS.get() - before, 0);
-    assert!(answers > 1000 * 12 * 9);
-    assert_eq!((session.counts().requests, session.counts().exceptions), (12_000, 2_000));
+    assert!(answers > 1000 * 20 * 9);
+    // Beyond the map, no file, no queue.
+    assert_eq!((session.counts().requests, session.counts().exceptions), (20_000, 4_000));
     assert!(image.view().pending() > 0);
+
+    // The same on a serial line, both ways of framing.
+    for mode in [Mode::Rtu, Mode::Ascii] {
+        let device = Device::line(&[(1, 0)], true, Shared::open());
+        let mut line = Line::new(mode, 0, device, 1, 1);
+        let frames: Vec<Vec<u8>> = requests.iter().map(|pdu| serial_frame(mode, pdu)).collect();
+        let (mut sent, mut seq) = (0, 0);
+        let before = ALLOCATIONS.get();
+        for frame in frames.iter().cycle().take(2000) {
+            seq += 1;
+            let mut chunk = SerialChunk { flags: serial_flag::END, ..SerialChunk::default() };
+            chunk.stamp.seq = seq;
+            image.begin();
+            line.chunk(&chunk, frame, &mut image, &mut |answer| {
+                sent += answer.len();
+                true
+            });
+        }
+        assert_eq!(ALLOCATIONS.get() - before, 0, "{mode:?}");
+        assert!(sent > 2000 * 5, "{mode:?}");
+    }
+}
+
+fn serial_frame(mode: Mode, pdu: &[u8]) -> Vec<u8> {
+    if mode == Mode::Rtu {
+        let mut out = [0; rtu::MAX_ADU];
+        let len = rtu::encode(1, pdu, &mut out);
+        return out[..len].to_vec();
+    }
+    let mut out = [0; ascii::MAX_ADU];
+    let len = ascii::encode(1, pdu, &mut out);
+    out[..len].to_vec()
 }

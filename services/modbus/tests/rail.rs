@@ -3,7 +3,9 @@
 #![allow(clippy::unwrap_used, reason = "helpers of a test, outside #[test] functions")]
 
 use ipc_types::image_write;
-use ipc_types::payload::{Event, Image, ImageWrite, Inputs, PlcState, Status};
+use ipc_types::payload::{
+    Event, Image, ImageWrite, Inputs, Job, JobResult, PlcState, SerialChunk, Status, serial_flag,
+};
 use ipc_types::testing::{TestRail, join, service, topic};
 use ipc_types::topic::{EVENTS, TopicKind};
 use ipc_types::wiring::{Area, Neighbours, Wiring};
@@ -21,13 +23,22 @@ const CONFIG: &str = r#"{
     "tcp": { "address": "127.0.0.1", "max_connections": 2 },
     "map": [ { "table": "holding", "at": 0, "count": 16, "area": "%MW0" },
              { "table": "holding", "at": 100, "count": 2, "area": "%IW2", "own": true },
-             { "table": "coils", "at": 0, "count": 64, "area": "%QX0.0" } ]
+             { "table": "coils", "at": 0, "count": 64, "area": "%QX0.0" } ],
+    "serial": [ { "port": "com1", "unit": 5 } ],
+    "enable_from": "%MX40.0",
+    "clients_to": "%IB20"
 }"#;
 
 /// What the client tells the thread that plays the PLC.
 enum Tell {
     /// Publish images in this state, or none.
     Scan(Option<PlcState>),
+    /// Put these bytes on the serial line as one frame, and answer with what comes back within a while.
+    Line(Vec<u8>, Sender<Vec<u8>>),
+    /// Send this command, answer with the code of its result.
+    Job(&'static str, Sender<u32>),
+    /// Set a byte of %M.
+    Marker(usize, u8),
     /// Answer with %M, %Q and the number of messages taken so far.
     Show(Sender<Shown>),
     Done,
@@ -91,17 +102,74 @@ impl Client {
     }
 }
 
+/// A frame for unit 5 and its CRC.
+fn rtu(pdu: &[u8]) -> Vec<u8> {
+    let mut out = [0; 256];
+    let len = dinrail_modbus::protocol::rtu::encode(5, pdu, &mut out);
+    out[..len].to_vec()
+}
+
+impl Client {
+    fn line(&self, frame: Vec<u8>) -> Vec<u8> {
+        let (answer, shown) = channel();
+        self.tell.send(Tell::Line(frame, answer)).unwrap();
+        shown.recv_timeout(LONG).unwrap_or_default()
+    }
+
+    fn job(&self, job: &'static str) -> u32 {
+        let (answer, shown) = channel();
+        self.tell.send(Tell::Job(job, answer)).unwrap();
+        shown.recv_timeout(LONG).unwrap()
+    }
+}
+
+/// The serial line serves the same image, counts, and is switched with the rest.
+fn serial_line_and_switch(client: &mut Client) {
+    assert_eq!(client.line(rtu(&[3, 0, 0, 0, 1])), rtu(&[3, 2, 0x12, 0x55]));
+    assert_eq!(client.line(rtu(&[6, 0, 3, 0xAB, 0xCD])), rtu(&[6, 0, 3, 0xAB, 0xCD]));
+    assert_eq!(client.ask(&[3, 0, 3, 0, 1]), [3, 2, 0xAB, 0xCD]);
+    let mut wrong = rtu(&[3, 0, 0, 0, 1]);
+    wrong[2] ^= 1;
+    client.tell.send(Tell::Line(wrong, channel().0)).unwrap();
+    // Counted: one damaged frame.
+    assert_eq!(client.line(rtu(&[8, 0, 0x0C, 0, 0])), rtu(&[8, 0, 0x0C, 0, 1]));
+    let port = client.stream.local_addr().unwrap().port().to_le_bytes();
+    let list = [1, 0, 127, 0, 0, 1, port[0], port[1], 0, 0, 0, 0, 0, 0];
+    client.shows(|shown| shown.inputs.get(4..18) == Some(&list[..]));
+    client.shows(|shown| shown.status["serial"][0]["sent"] == 3 && shown.status["serial"][0]["crc_errors"] == 1);
+
+    // Off and on by command, by the bit.
+    assert_eq!(client.job(r#"{ "do": "fly" }"#), 3);
+    assert_eq!(client.job(r#"{ "do": "disable" }"#), 0);
+    assert_eq!(client.stream.read(&mut [0; 1]).unwrap_or(0), 0, "the connection is closed");
+    client.shows(|shown| shown.status["enabled"] == false && shown.status["listen"].is_null());
+    assert!(client.line(rtu(&[3, 0, 0, 0, 1])).is_empty());
+    assert_eq!(client.job(r#"{ "do": "enable" }"#), 0);
+    client.shows(|shown| shown.status["enabled"] == true);
+    assert_eq!(client.line(rtu(&[3, 0, 0, 0, 1])), rtu(&[3, 2, 0x12, 0x55]));
+    client.tell.send(Tell::Marker(40, 0)).unwrap();
+    client.shows(|shown| shown.status["enabled"] == false);
+    assert!(client.line(rtu(&[3, 0, 0, 0, 1])).is_empty());
+    client.tell.send(Tell::Marker(40, 1)).unwrap();
+    client.shows(|shown| shown.status["enabled"] == true);
+}
+
 const READ_0: [u8; 5] = [3, 0, 0, 0, 1];
 
 fn client(address: SocketAddr, tell: Sender<Tell>) {
-    let stream = TcpStream::connect(address).unwrap();
-    stream.set_nodelay(true).unwrap();
-    stream.set_read_timeout(Some(LONG)).unwrap();
-    let mut client = Client { stream, tell };
+    let connect = || {
+        let stream = TcpStream::connect(address).unwrap();
+        stream.set_nodelay(true).unwrap();
+        stream.set_read_timeout(Some(LONG)).unwrap();
+        stream
+    };
+    let mut client = Client { stream: connect(), tell };
 
-    // No image yet.
-    assert_eq!(client.ask(&READ_0), [0x83, 4]);
+    // No image yet, so the bit that switches the server on is not set either.
+    assert_eq!(client.stream.read(&mut [0; 1]).unwrap_or(0), 0);
     client.tell.send(Tell::Scan(Some(PlcState::Run))).unwrap();
+    client.shows(|shown| shown.status["enabled"] == true);
+    client.stream = connect();
     client.until(&READ_0, &[3, 2, 0, 0]);
     client.shows(|shown| shown.events.iter().any(|event| event == "safe_left"));
 
@@ -119,8 +187,11 @@ fn client(address: SocketAddr, tell: Sender<Tell>) {
     // Registers that the server owns go to its part of %I.
     assert_eq!(client.ask(&[6, 0, 100, 0xAB, 0xCD]), [6, 0, 100, 0xAB, 0xCD]);
     assert_eq!(client.ask(&[3, 0, 100, 0, 2]), [3, 4, 0xAB, 0xCD, 0, 0]);
-    client.shows(|shown| shown.inputs == [0xCD, 0xAB, 0, 0, 0]);
+    client.shows(|shown| shown.inputs.get(..4) == Some(&[0xCD, 0xAB, 0, 0][..]));
     assert_eq!(client.ask(&[3, 0, 50, 0, 1]), [0x83, 2]);
+
+    serial_line_and_switch(&mut client);
+    client.stream = connect();
 
     // A stopped PLC, a running one, a silent one.
     client.tell.send(Tell::Scan(Some(PlcState::Stop))).unwrap();
@@ -139,7 +210,7 @@ fn client(address: SocketAddr, tell: Sender<Tell>) {
     let first = &shown.status["client_list"][0];
     assert_eq!((first["address"].as_str(), first["last_function"].as_u64()), (Some("127.0.0.1"), Some(6)));
     assert_eq!(first["port"].as_u64(), Some(u64::from(client.stream.local_addr().unwrap().port())));
-    assert_eq!(shown.status["writes"]["queued"], 3);
+    assert_eq!(shown.status["writes"]["queued"], 4);
     assert_eq!(shown.status["writes"]["own"], 1);
     drop(second);
     client.shows(|shown| shown.status["clients"] == 1 && shown.status["counters"]["closed_peer"] == 1);
@@ -162,6 +233,10 @@ fn rail() -> TestRail {
             topic(TopicKind::Image, "plc"),
             topic(TopicKind::Writes, "plc").wakes("plc", 0),
             topic(TopicKind::Inputs, "modbus").wakes("plc", 0),
+            topic(TopicKind::Jobs, "modbus").wakes("modbus", 0),
+            topic(TopicKind::Results, "modbus"),
+            topic(TopicKind::SerialRx, "com1").wakes("modbus", 1),
+            topic(TopicKind::SerialTx, "com1"),
         ],
     )
 }
@@ -192,6 +267,12 @@ fn play_plc(rail: &TestRail, told: &Receiver<Tell>) {
     let mut status = ctx.subscriber::<Status>("modbus/status").unwrap();
     let mut events = ctx.subscriber::<Event>(EVENTS).unwrap();
     let mut areas = [vec![0; AREA], vec![0; AREA], vec![0; AREA]];
+    areas[Area::Marker as usize][40] = 1;
+    let mut rx = ctx.publisher::<SerialChunk>("com1/rx").unwrap();
+    let mut tx = ctx.subscriber::<SerialChunk>("com1/tx").unwrap();
+    let mut jobs = ctx.publisher::<Job>("modbus/jobs").unwrap();
+    let mut results = ctx.subscriber::<JobResult>("modbus/results").unwrap();
+    let (mut asked, mut waiting_job) = (None::<(Sender<Vec<u8>>, Instant)>, None::<(Sender<u32>, u64)>);
     let (mut state, mut ack, mut messages) = (None, (0, 0, 0), 0);
     let mut latest = serde_json::Value::Null;
     let (mut latest_inputs, mut kinds) = (Vec::new(), Vec::new());
@@ -215,6 +296,36 @@ fn play_plc(rail: &TestRail, told: &Receiver<Tell>) {
             (header.ack_writer[0], header.ack_generation[0], header.ack_seq[0]) = ack;
             image.send_tail(header, &areas.concat()).unwrap();
         }
+        let mut sent = Vec::new();
+        tx.drain(64, |header, bytes| {
+            assert!(header.first_t_ns > header.stamp.t_ns, "an answer has its deadline");
+            sent.push((header.stamp, bytes.to_vec()));
+        });
+        for (stamp, bytes) in sent {
+            let echo = SerialChunk {
+                flags: serial_flag::TX_ECHO | serial_flag::END,
+                tx_seq: stamp.seq,
+                tx_writer: stamp.writer,
+                tx_generation: stamp.generation,
+                ..SerialChunk::default()
+            };
+            rx.send_tail(echo, &bytes).unwrap();
+            rx.ring();
+            if let Some((answer, _)) = asked.take() {
+                let _ = answer.send(bytes);
+            }
+        }
+        // Silence long enough to be one: the sender learns it by the end of its channel.
+        if asked.as_ref().is_some_and(|(_, since)| since.elapsed() > Duration::from_millis(500)) {
+            asked = None;
+        }
+        results.drain(16, |result, _| {
+            if let Some((answer, seq)) = &waiting_job
+                && *seq == result.job_seq
+            {
+                answer.send(result.code).unwrap();
+            }
+        });
         inputs.newest(|_, tail| latest_inputs = tail.to_vec());
         status.newest(|_, tail| latest = serde_json::from_slice(tail).unwrap());
         events.drain(256, |_, tail| {
@@ -223,6 +334,18 @@ fn play_plc(rail: &TestRail, told: &Receiver<Tell>) {
         });
         match told.recv_timeout(Duration::from_millis(2)) {
             Ok(Tell::Scan(wanted)) => state = wanted,
+            Ok(Tell::Line(bytes, answer)) => {
+                asked = Some((answer, Instant::now()));
+                let header = SerialChunk { flags: serial_flag::END, ..SerialChunk::default() };
+                rx.send_tail(header, &bytes).unwrap();
+                rx.ring();
+            }
+            Ok(Tell::Job(text, answer)) => {
+                let seq = jobs.send_tail(Job { deadline_t_ns: u64::MAX, ..Job::default() }, text.as_bytes());
+                jobs.ring();
+                waiting_job = Some((answer, seq.unwrap()));
+            }
+            Ok(Tell::Marker(at, value)) => areas[Area::Marker as usize][at] = value,
             Ok(Tell::Show(answer)) => {
                 let shown = Shown {
                     marker: areas[Area::Marker as usize].clone(),

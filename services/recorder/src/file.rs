@@ -1,7 +1,7 @@
 //! One MCAP file being written.
 //!
 //! Small chunks compress badly and cost an index each, large ones are lost whole when the process is killed. So
-//! a chunk is closed when it is full or two seconds old, and until then its messages also stand *raw* behind the
+//! a chunk is closed when it is full or three seconds old, and until then its messages also stand *raw* behind the
 //! last chunk, as plain MCAP message records, which is where readers find them after kill -9. The chunk, when
 //! it is closed, takes their place. At every moment the file is a valid MCAP file without its end.
 
@@ -20,7 +20,7 @@ use std::time::{Duration, Instant};
 /// Uncompressed bytes after which a chunk is closed.
 pub const CHUNK_BYTES: usize = 256 * 1024;
 /// Age after which a chunk is closed: how much a torn write of a chunk can lose at most.
-pub const CHUNK_AGE: Duration = Duration::from_secs(2);
+pub const CHUNK_AGE: Duration = Duration::from_secs(3);
 /// Bytes of a message record before its data: opcode, length, channel, sequence, two times.
 const MESSAGE_HEAD: usize = 1 + 8 + 2 + 4 + 8 + 8;
 const OP_MESSAGE: u8 = 0x05;

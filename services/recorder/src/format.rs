@@ -304,13 +304,14 @@ mod tests {
         let names: Vec<_> = recorded.iter().map(|t| t.name.as_str()).collect();
         assert_eq!(
             names,
-            ["svc/rx", "svc/scan", "svc/keyframe", "svc/results", "svc/status", "stack/events"]
+            // Of a CAN and of a serial driver.
+            ["svc/rx", "svc/rx", "svc/scan", "svc/keyframe", "svc/results", "svc/status", "stack/events"]
         );
         let frames = channel(recorded[0]);
         assert_eq!((frames.message_encoding.as_str(), frames.schema_encoding.as_str()), ("ros1", "ros1msg"));
         assert_eq!(frames.schema, TopicKind::CanRx.ros1msg());
         assert_eq!(frames.metadata["kind"], "can_rx");
-        let events = channel(recorded[5]);
+        let events = channel(recorded[6]);
         assert_eq!(
             (events.message_encoding.as_str(), events.schema_name.as_str()),
             ("json", "dinrail_v1/Event")
@@ -360,7 +361,13 @@ mod tests {
         write("plc.00000000000000bb.wasm", 10);
         write("plc.00000000000000cc.wasm", 20);
         write("plc2.00000000000000dd.wasm", 99);
-        for no in ["io.00000000000000aa.wasm", "gone.00000000000000aa.wasm", "plc.12.wasm", "plc.wasm", "stack.json"] {
+        for no in [
+            "io.00000000000000aa.wasm",
+            "gone.00000000000000aa.wasm",
+            "plc.12.wasm",
+            "plc.wasm",
+            "stack.json",
+        ] {
             write(no, 0);
         }
         std::os::unix::fs::symlink("/etc/passwd", dir.path().join("plc.00000000000000ee.wasm")).unwrap();
@@ -374,7 +381,13 @@ mod tests {
     #[test]
     fn only_a_loaded_event_says_loaded() {
         let event = |kind| {
-            let body = EventBody::now(kind, ipc_types::event::Level::Info, "plc", "\"loaded\"", serde_json::Value::Null);
+            let body = EventBody::now(
+                kind,
+                ipc_types::event::Level::Info,
+                "plc",
+                "\"loaded\"",
+                serde_json::Value::Null,
+            );
             serde_json::to_vec(&body).unwrap()
         };
         assert!(says_loaded(&event(EventKind::Loaded)));

@@ -307,7 +307,13 @@ fn a_program_loaded_while_recording_stands_in_this_file_and_the_next() {
     let loaded = |seq: u64| {
         let body = serde_json::json!({ "event": "loaded", "level": "info", "service": "plc", "message": "program loaded",
                                        "utc_ns": 1, "t_ns": 1 });
-        message(EVENTS, ipc_types::payload::Event::default(), body.to_string().as_bytes(), seq, clock::mono_ns())
+        message(
+            EVENTS,
+            ipc_types::payload::Event::default(),
+            body.to_string().as_bytes(),
+            seq,
+            clock::mono_ns(),
+        )
     };
     let names = |file: &std::path::Path| {
         let found = dinrail_recorder::scan::attachments(file).unwrap();
@@ -315,6 +321,8 @@ fn a_program_loaded_while_recording_stands_in_this_file_and_the_next() {
     };
     let mut rig = Rig::start(stack.clone(), Config::default());
     rig.send(&[frame(1, clock::mono_ns())]);
+    // The file is begun.
+    rig.settle();
     std::fs::write(module("00000000000000bb"), b"\0asm second").unwrap();
     // Written, but not loaded: not in the file.
     rig.send(&[frame(2, clock::mono_ns())]);

@@ -65,7 +65,34 @@ fn mistakes() {
         said(json!({ "device": "socket://10.0.0.1:4001", "rs485": "kernel", "rts_delay_after": "100us", "pace": true })),
         said(json!({ "rs485": "rts", "flow": "rtscts", "max_frame": 0, "timeout": "0" })),
     ];
-    insta::assert_snapshot!(all.join("\n"), @"");
+    insta::assert_snapshot!(all.join("\n"), @r#"
+    Error device: 'COM1' is no serial device -> write e.g. device = "/dev/ttyUSB0", better its name in /dev/serial/by-id; "socket://host:port" for a port over TCP, "pty:/tmp/com1" for a pseudo-terminal; `dinrail serial list` lists ports
+    Warning device: this machine has no /dev/ttyNOTHERE now -> the driver waits for it; `dinrail serial list` lists ports
+    Error baud: baud 9 is out of range -> use 50 to 12000000, e.g. 19200
+    Error data_bits: framing "rtu" needs 8 data bits, not 7 -> MODBUS over Serial Line V1.02, 2.5.1: each byte of RTU is sent as 8 data bits; for 7 use framing = "ascii", for 5 to 7 without Modbus framing = "raw", "silence", "length" or "delimiter"
+    Error data_bits: framing "ascii" needs 7 or 8 data bits, not 6 -> use 7
+    Error stop_bits: stop_bits 3 is out of range -> use 1 or 2
+    Warning stop_bits: 19200 8N1: without parity the standard asks for 2 stop bits (V1.02, 2.5.1) -> set stop_bits = 2, or parity = "even"; leave it if all devices on the line are set so
+    
+    
+    Error flow: flow "xonxoff" takes the bytes 11h and 13h out of RTU frames -> use "none" or "rtscts"
+    Error delimiter: delimiter of 0 bytes is out of range -> use 1 to 8 bytes, e.g. "\r\n"
+    Warning length: length has no meaning for this framing, only for "length" -> remove the key, or change framing
+    Warning delimiter: delimiter has no meaning for this framing, only for "delimiter" -> remove the key, or change framing
+    Error grace: grace 2min is out of range -> use at most 60s
+    Error silence: silence must be above 0 -> use e.g. "1s"; the default of silence is 3.5 characters
+    Error length: framing "length" needs length -> add e.g. length = 12
+    Error length: length 70000 is out of range -> use 1 to 65536
+    Warning strict_t15: strict_t15 has no meaning for this framing, only for "rtu" -> remove the key, or change framing
+    Warning rs485: rs485 has no meaning for this device -> remove the key
+    Warning pace: pace has no meaning for a port over TCP -> remove the key
+    Error rts_delay_after: rts_delay_after 100us: the kernel takes whole ms up to 100 -> use e.g. "1ms", or rs485 = "rts"
+    Warning rs485: rs485 has no meaning for this device -> remove the key
+    Error flow: RTS cannot switch the transmitter and control the flow -> remove flow: RS-485 has none
+    Error max_frame: max_frame 0 is out of range -> use 1 to 65536
+    Warning max_frame: max_frame has no meaning for this framing, only for "delimiter" and "silence" -> remove the key, or change framing
+    Error timeout: timeout must be above 0 -> use e.g. "1s"; the default of silence is 3.5 characters
+    "#);
 }
 
 #[test]

@@ -126,5 +126,15 @@ fn sentences() {
         .to_string(),
     ];
     std::fs::remove_file(file).unwrap();
-    insta::assert_snapshot!(all.join("\n"), @"");
+    insta::assert_snapshot!(all.join("\n"), @r#"
+    there is no device /dev/ttyNOTHERE: plug the adapter in; `dinrail serial list` lists ports, with names that stay the same
+    /dev is no serial device; `dinrail serial list` lists ports
+    /dev/null is no serial device; `dinrail serial list` lists ports
+    /etc/hostname is no serial device; `dinrail serial list` lists ports
+    cannot connect to socket://127.0.0.1:PORT: Connection refused (os error 111); is ser2net (or what serves the port) running, and does the address say host and port?
+    cannot make a pseudo-terminal at FILE: something that is no link is there
+    no permission for /dev/ttyUSB0: it belongs to group 'dialout'; run `sudo usermod -aG dialout $USER`, then log in again
+    /dev/ttyUSB0: its driver cannot switch an RS-485 transmitter (rs485 = "kernel"): use rs485 = "adapter" if the adapter switches by itself, as most USB ones do, or rs485 = "rts" to let dinrail switch RTS
+    /dev/ttyUSB0 does not take 19200 5E1: data_bits read back otherwise; use settings that its chip has, or verify = false
+    "#);
 }

@@ -90,8 +90,7 @@ impl Received {
 
 pub fn run(bench: &mut Bench) -> anyhow::Result<()> {
     let seconds = bench.seconds(SECONDS);
-    let ports =
-        bus_peers::Ports { cannelloni: free_port()?, socketcand: free_port()?, slcan: free_port()? };
+    let ports = bus_peers::Ports { cannelloni: free_port()?, socketcand: free_port()?, slcan: free_port()? };
     let toml = STACK
         .replace("CANNELLONI", &ports.cannelloni.to_string())
         .replace("SOCKETCAND", &ports.socketcand.to_string())

@@ -6,8 +6,7 @@ use super::listen::{LOOK, Listener, widest};
 use super::names::Names;
 use super::show::{Form, Paint, Printer, Time};
 use super::{ended_by, to_frame};
-use crate::commands::{DATA_LOSS, print};
-use crate::supervise::client::{find, observe};
+use crate::commands::DATA_LOSS;
 use dinrail_can::protocol::candump;
 use ipc_types::clock;
 use ipc_types::reactor::Reactor;
@@ -18,7 +17,7 @@ use std::process::ExitCode;
 use std::time::Instant;
 
 pub fn run(args: &DumpArgs, json: bool) -> anyhow::Result<ExitCode> {
-    let ctx = observe(&find(args.which.stack.as_deref())?)?;
+    let ctx = super::join(args.which.stack.as_deref())?;
     let names = Names::of(&ctx.stack);
     let filter = Filter::parse(&args.filter.filter, &names)?;
     let buses = super::buses(&ctx, &args.buses)?;
@@ -59,9 +58,7 @@ pub fn run(args: &DumpArgs, json: bool) -> anyhow::Result<ExitCode> {
             let flushed = log.write_all(lines.as_bytes()).and_then(|()| log.flush());
             flushed.map_err(|e| anyhow::anyhow!("writing {}: {e}", shown(args)))?;
         }
-        if !text.is_empty() {
-            print(&text);
-        }
+        ended |= !text.is_empty() && !super::put(&text);
         told = tell_losses(&listener, told, ended);
     }
     Ok(if told > 0 { ExitCode::from(DATA_LOSS) } else { ExitCode::SUCCESS })

@@ -8,8 +8,16 @@ use ipc_types::payload::{CanFrame, can_flag, id_flag};
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Test {
     /// `(id & mask) == value`, of frames with this length of identifier.
-    Mask { value: u32, mask: u32, extended: bool },
-    Range { from: u32, to: u32, extended: bool },
+    Mask {
+        value: u32,
+        mask: u32,
+        extended: bool,
+    },
+    Range {
+        from: u32,
+        to: u32,
+        extended: bool,
+    },
     /// Bus (any when `None`) and identifier with its flag.
     Named(Vec<(String, u32)>),
     Error,
@@ -80,7 +88,9 @@ impl Test {
 
 fn parse_one(text: &str, names: &Names, turned: &mut bool) -> Result<Test, UsageError> {
     // Without the # as well: shells take it for a comment where it is not quoted.
-    let kind = KINDS.iter().find(|(name, _)| name.trim_start_matches('#').eq_ignore_ascii_case(text.trim_start_matches('#')));
+    let kind = KINDS
+        .iter()
+        .find(|(name, _)| name.trim_start_matches('#').eq_ignore_ascii_case(text.trim_start_matches('#')));
     if let Some((_, test)) = kind {
         return Ok(test.clone());
     }
@@ -144,7 +154,11 @@ mod tests {
     use super::*;
 
     fn names() -> Names {
-        Names::of_table(&[("can0", 0x1A0, "Speed"), ("can1", 0x8000_0001, "Level"), ("can0", 0x2B0, "Temperature")])
+        Names::of_table(&[
+            ("can0", 0x1A0, "Speed"),
+            ("can1", 0x8000_0001, "Level"),
+            ("can0", 0x2B0, "Temperature"),
+        ])
     }
 
     fn filter(texts: &[&str]) -> Result<Filter, UsageError> {
@@ -202,7 +216,21 @@ mod tests {
             .iter()
             .map(|text| filter(&[text]).unwrap_err().to_string())
             .collect();
-        insta::assert_snapshot!(said.join("\n"), @"");
+        insta::assert_snapshot!(said.join("\n"), @r#"
+filter 'Sped' is neither an identifier (3 or 8 hex digits; 123:7F0, 123~7F0, 100-1FF) nor a kind (#error, #rtr, #fd, #ext, #tx, #rx) nor a name
+did you mean 'Speed'?
+names in this stack: Level, Speed, Temperature
+filter '#eror': did you mean '#error'?
+kinds of frames: #error, #rtr, #fd, #ext, #tx, #rx
+filter '1A00' is neither an identifier (3 or 8 hex digits; 123:7F0, 123~7F0, 100-1FF) nor a kind (#error, #rtr, #fd, #ext, #tx, #rx) nor a name
+names in this stack: Level, Speed, Temperature
+filter '200-100': a range goes from the lower to the higher identifier, both with 3 digits or both with 8
+filter '100-00000200': a range goes from the lower to the higher identifier, both with 3 digits or both with 8
+filter '1A0:' is neither an identifier (3 or 8 hex digits; 123:7F0, 123~7F0, 100-1FF) nor a kind (#error, #rtr, #fd, #ext, #tx, #rx) nor a name
+names in this stack: Level, Speed, Temperature
+filter '' is neither an identifier (3 or 8 hex digits; 123:7F0, 123~7F0, 100-1FF) nor a kind (#error, #rtr, #fd, #ext, #tx, #rx) nor a name
+names in this stack: Level, Speed, Temperature
+"#);
         let none = Filter::parse(&["Speed".to_owned()], &Names::default()).unwrap_err().to_string();
         assert!(none.ends_with("the stack gives no names to frames"), "{none}");
     }

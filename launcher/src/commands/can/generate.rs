@@ -5,15 +5,14 @@ use super::flight::Order;
 use super::pattern::Pattern;
 use super::sender::{Counts, Sender};
 use super::{ended_by, from_frame};
-use crate::commands::{DATA_LOSS, println};
-use crate::supervise::client::{find, observe};
+use crate::commands::DATA_LOSS;
 use ipc_types::reactor::Reactor;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 pub fn run(args: &GenArgs, json: bool) -> anyhow::Result<ExitCode> {
     let mut pattern = Pattern::of(args)?;
-    let mut ctx = observe(&find(args.which.stack.as_deref())?)?;
+    let mut ctx = super::join(args.which.stack.as_deref())?;
     let order = if args.in_order { Order::Exact } else { Order::ByIdentifier };
     let mut sender = Sender::new(&mut ctx, &args.bus, order)?;
     let mut reactor = Reactor::new()?;
@@ -53,16 +52,23 @@ pub fn run(args: &GenArgs, json: bool) -> anyhow::Result<ExitCode> {
 }
 
 /// What was done, and whether all of it was seen.
-fn report(bus: &str, counts: &Counts, took: Duration, why: Option<&str>, in_order: bool, json: bool) -> ExitCode {
+fn report(
+    bus: &str,
+    counts: &Counts,
+    took: Duration,
+    why: Option<&str>,
+    in_order: bool,
+    json: bool,
+) -> ExitCode {
     let whole = counts.echoed == counts.sent && counts.out_of_order == 0;
     let rate = counts.sent as f64 / took.as_secs_f64().max(1e-9);
     if json {
         let mut value = serde_json::to_value(counts).unwrap_or_default();
         value["bus"] = bus.into();
         value["seconds"] = took.as_secs_f64().into();
-        println(&value.to_string());
+        super::put(&format!("{value}\n"));
     } else {
-        println(&text(bus, counts, took.as_secs_f64(), rate, in_order));
+        super::put(&(text(bus, counts, took.as_secs_f64(), rate, in_order) + "\n"));
     }
     if let Some(why) = why {
         eprintln!("dinrail: {why}");

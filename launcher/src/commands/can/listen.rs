@@ -1,7 +1,7 @@
 //! Reading one or several buses of a running stack as an observer.
 
 use super::merge::Merge;
-use super::topic;
+use super::{place, topic};
 use ipc_types::payload::CanFrame;
 use ipc_types::port::Subscriber;
 use ipc_types::topic::TopicKind;
@@ -27,7 +27,8 @@ impl Listener {
     pub fn new(ctx: &Context, buses: Vec<String>) -> anyhow::Result<Self> {
         let mut readers = Vec::new();
         for bus in &buses {
-            readers.push(ctx.subscriber::<CanFrame>(&topic(ctx, bus, TopicKind::CanRx)?)?);
+            let name = topic(ctx, bus, TopicKind::CanRx)?;
+            readers.push(place(ctx, ctx.subscriber::<CanFrame>(&name))?);
         }
         let merge = Merge::new(buses.len(), HOLD_NS);
         Ok(Self { buses, readers, merge })

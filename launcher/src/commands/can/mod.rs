@@ -22,14 +22,17 @@ pub mod source;
 mod stats;
 
 use crate::stackfile::nearest;
+use crate::supervise::client::{find, observe};
 use args::CanCommand;
 use dinrail_can::protocol::frame::Frame;
 use ipc_types::Context;
 use ipc_types::payload::CanFrame;
 use ipc_types::topic::TopicKind;
 use ipc_types::units::Span;
-use std::process::ExitCode;
-use std::time::Instant;
+use std::io::Write;
+use std::path::Path;
+use std::process::{Command, ExitCode, Stdio};
+use std::time::{Duration, Instant};
 
 pub fn run(command: CanCommand, json: bool) -> anyhow::Result<ExitCode> {
     match command {
@@ -42,9 +45,64 @@ pub fn run(command: CanCommand, json: bool) -> anyhow::Result<ExitCode> {
     }
 }
 
+/// How long a clean-up of what dead tools left may take.
+const CLEAN_LIMIT: Duration = Duration::from_secs(2);
+
+/// Joins the stack meant. Tools that were killed keep their place until somebody cleans up after them: when there is none
+/// left, that is done first.
+fn join(stack: Option<&str>) -> anyhow::Result<Context> {
+    let stack = find(stack)?;
+    let full = |e: &ipc_types::rail::RailError| e.to_string().contains("ExceedsMaxSupported");
+    match observe(&stack) {
+        Err(e) if full(&e) => clean_up(&stack.root),
+        result => return Ok(result?),
+    }
+    observe(&stack).map_err(|e| if full(&e) { crowded(&stack.stack) } else { e.into() })
+}
+
+/// Places for tools are counted per stack and per topic.
+fn crowded(stack: &str) -> anyhow::Error {
+    let places = ipc_types::topic::SPARE_PORTS;
+    anyhow::anyhow!(
+        "stack '{stack}': {places} tools (`can dump`, `top`, ...) look at it already, and there is no place for more: end one and try again"
+    )
+}
+
+/// In a process of its own, because it can hang.
+fn clean_up(root: &Path) {
+    let Ok(own) = std::env::current_exe() else { return };
+    let mut command = Command::new(own);
+    command.arg("__clean").arg("--root").arg(root).arg("--parent").arg(std::process::id().to_string());
+    let spawned = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
+    let Ok(mut child) = spawned else { return };
+    let begin = Instant::now();
+    while begin.elapsed() < CLEAN_LIMIT {
+        if !matches!(child.try_wait(), Ok(None)) {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let _ = child.kill();
+    let _ = child.wait();
+}
+
+/// A port on a topic; when it has no place left, in words.
+fn place<T>(ctx: &Context, port: Result<T, ipc_types::rail::RailError>) -> anyhow::Result<T> {
+    port.map_err(|e| {
+        if e.to_string().contains("ExceedsMaxSupported") { crowded(&ctx.stack.name) } else { e.into() }
+    })
+}
+
+/// Prints; false when nobody reads any more. Not by ending the process: its place on the rail must be given back.
+fn put(text: &str) -> bool {
+    let mut out = std::io::stdout().lock();
+    out.write_all(text.as_bytes()).and_then(|()| out.flush()).is_ok()
+}
+
 /// Every bus of the stack, in its order.
 fn all_buses(ctx: &Context) -> Vec<String> {
-    let has = |s: &&ipc_types::stack::ServiceEntry| s.wiring.topics.iter().any(|t| t.kind == TopicKind::CanRx);
+    let has =
+        |s: &&ipc_types::stack::ServiceEntry| s.wiring.topics.iter().any(|t| t.kind == TopicKind::CanRx);
     ctx.stack.services.iter().filter(has).map(|s| s.name.clone()).collect()
 }
 

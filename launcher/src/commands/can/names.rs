@@ -27,7 +27,8 @@ impl Names {
     /// The names of a stack. What cannot be read is left out: names are a help, not a condition.
     pub fn of(stack: &Stack) -> Self {
         let mut names = Self::default();
-        let has_bus = |s: &&ipc_types::stack::ServiceEntry| s.wiring.topics.iter().any(|t| t.kind == TopicKind::CanRx);
+        let has_bus =
+            |s: &&ipc_types::stack::ServiceEntry| s.wiring.topics.iter().any(|t| t.kind == TopicKind::CanRx);
         let buses: Vec<&str> = stack.services.iter().filter(has_bus).map(|s| s.name.as_str()).collect();
         for service in &stack.services {
             let named = service.config.get("bus").and_then(|v| v.as_str());
@@ -94,7 +95,9 @@ impl Names {
         }
         let id = frame.id() | (frame.can_id & id_flag::EFF);
         if let Some(signals) = self.signals.get(&(id, bus.to_owned())) {
-            let value = |s: &Signal| s.codec.filter(|_| !frame.is_remote()).and_then(|c| value_text(&c, frame.payload()));
+            let value = |s: &Signal| {
+                s.codec.filter(|_| !frame.is_remote()).and_then(|c| value_text(&c, frame.payload()))
+            };
             return signals.iter().map(|s| (s.name.clone(), value(s))).collect();
         }
         if self.canopen.contains(bus) && !frame.is_extended() {

@@ -45,7 +45,9 @@ impl Pattern {
         let fd_flags = if args.brs { FD_BRS } else { 0 } | if args.esi { FD_ESI } else { 0 };
         let fd = (args.fd || fd_flags != 0).then_some(fd_flags);
         if fd.is_some() && args.rtr {
-            return Err(UsageError("CAN FD has no remote frames: leave out --rtr, --brs or --esi".to_owned()));
+            return Err(UsageError(
+                "CAN FD has no remote frames: leave out --rtr, --brs or --esi".to_owned(),
+            ));
         }
         let (id, extended) = id(&args.id, args.extended, args.mix)?;
         let data = data(&args.data)?;
@@ -133,13 +135,18 @@ fn fixed_length(len: usize, fd: bool) -> Result<Length, UsageError> {
 
 fn id(text: &str, extended: bool, mix: bool) -> Result<(Id, bool), UsageError> {
     let number = |digits: &str| {
-        let value = Some(digits).filter(|d| (1..=8).contains(&d.len()) && d.bytes().all(|c| c.is_ascii_hexdigit()));
+        let value =
+            Some(digits).filter(|d| (1..=8).contains(&d.len()) && d.bytes().all(|c| c.is_ascii_hexdigit()));
         let value = value.and_then(|d| u32::from_str_radix(d, 16).ok()).filter(|v| *v <= EFF_MASK);
         let value = value.ok_or_else(|| {
-            UsageError(format!("--id '{text}' must be a hex identifier up to 1FFFFFFF, `inc`, `inc:100` or `random`"))
+            UsageError(format!(
+                "--id '{text}' must be a hex identifier up to 1FFFFFFF, `inc`, `inc:100` or `random`"
+            ))
         })?;
         if value > SFF_MASK && !extended && !mix && digits.len() < 8 {
-            return Err(UsageError(format!("--id {text} needs 29 bits: write it with 8 digits or give --extended")));
+            return Err(UsageError(format!(
+                "--id {text} needs 29 bits: write it with 8 digits or give --extended"
+            )));
         }
         Ok((value, extended || digits.len() == 8))
     };
@@ -161,14 +168,16 @@ fn data(text: &str) -> Result<Data, UsageError> {
         _ => {}
     }
     let bytes = text.as_bytes().chunks(2).map(|pair| {
-        let pair = std::str::from_utf8(pair).ok().filter(|p| p.len() == 2 && p.bytes().all(|c| c.is_ascii_hexdigit()))?;
+        let pair = std::str::from_utf8(pair)
+            .ok()
+            .filter(|p| p.len() == 2 && p.bytes().all(|c| c.is_ascii_hexdigit()))?;
         u8::from_str_radix(pair, 16).ok()
     });
-    bytes
-        .collect::<Option<Vec<u8>>>()
-        .filter(|bytes| bytes.len() <= 64)
-        .map(Data::Fixed)
-        .ok_or_else(|| UsageError(format!("--data '{text}' must be pairs of hex digits, at most 64 bytes, `inc`, `random` or `zero`")))
+    bytes.collect::<Option<Vec<u8>>>().filter(|bytes| bytes.len() <= 64).map(Data::Fixed).ok_or_else(|| {
+        UsageError(format!(
+            "--data '{text}' must be pairs of hex digits, at most 64 bytes, `inc`, `random` or `zero`"
+        ))
+    })
 }
 
 #[cfg(test)]
@@ -181,7 +190,9 @@ mod tests {
 
     fn pattern(args: &str) -> Result<Pattern, UsageError> {
         let words = ["dinrail", "can", "gen", "can0"].into_iter().chain(args.split_whitespace());
-        let Command::Can(CanCommand::Gen(args)) = Cli::try_parse_from(words).unwrap().command else { panic!() };
+        let Command::Can(CanCommand::Gen(args)) = Cli::try_parse_from(words).unwrap().command else {
+            panic!()
+        };
         Pattern::of(&args)
     }
 
@@ -225,10 +236,30 @@ mod tests {
 
     #[test]
     fn mistakes_are_named() {
-        let said: Vec<String> = ["--id 800", "--id xyz", "--id 20000000", "--len 9", "--len x", "--fd --len 9", "--data 1", "--data 11223344556677889900", "--brs --rtr"]
-            .iter()
-            .map(|args| format!("{args}: {}", pattern(args).unwrap_err()))
-            .collect();
-        insta::assert_snapshot!(said.join("\n"), @"");
+        let said: Vec<String> = [
+            "--id 800",
+            "--id xyz",
+            "--id 20000000",
+            "--len 9",
+            "--len x",
+            "--fd --len 9",
+            "--data 1",
+            "--data 11223344556677889900",
+            "--brs --rtr",
+        ]
+        .iter()
+        .map(|args| format!("{args}: {}", pattern(args).unwrap_err()))
+        .collect();
+        insta::assert_snapshot!(said.join("\n"), @r#"
+--id 800: --id 800 needs 29 bits: write it with 8 digits or give --extended
+--id xyz: --id 'xyz' must be a hex identifier up to 1FFFFFFF, `inc`, `inc:100` or `random`
+--id 20000000: --id '20000000' must be a hex identifier up to 1FFFFFFF, `inc`, `inc:100` or `random`
+--len 9: 9 data bytes: a classic frame carries at most 8; --fd makes CAN FD frames
+--len x: --len 'x' must be a number of bytes, `inc` or `random`
+--fd --len 9: 9 data bytes: CAN FD carries 0-8, 12, 16, 20, 24, 32, 48 or 64
+--data 1: --data '1' must be pairs of hex digits, at most 64 bytes, `inc`, `random` or `zero`
+--data 11223344556677889900: 10 data bytes: a classic frame carries at most 8; --fd makes CAN FD frames
+--brs --rtr: CAN FD has no remote frames: leave out --rtr, --brs or --esi
+"#);
     }
 }

@@ -3,13 +3,12 @@
 use super::args::ReplayArgs;
 use super::filter::Filter;
 use super::flight::Order;
+use super::from_frame;
 use super::names::Names;
 use super::sender::{Counts, Sender};
 use super::source::{Contents, Source, contents};
-use super::from_frame;
-use crate::commands::{DATA_LOSS, UsageError, println};
+use crate::commands::{DATA_LOSS, UsageError};
 use crate::stackfile::nearest;
-use crate::supervise::client::{find, observe};
 use ipc_types::payload::{CanFrame, can_flag};
 use ipc_types::reactor::{Reactor, Wake};
 use std::collections::BTreeMap;
@@ -23,11 +22,15 @@ const LEAST_ROUND: Duration = Duration::from_millis(1);
 
 pub fn run(args: &ReplayArgs, json: bool) -> anyhow::Result<ExitCode> {
     if !SPEED.contains(&args.speed) {
-        return Err(UsageError(format!("--speed {} must lie between 0.001 and 1000; --no-wait is as fast as possible", args.speed)).into());
+        return Err(UsageError(format!(
+            "--speed {} must lie between 0.001 and 1000; --no-wait is as fast as possible",
+            args.speed
+        ))
+        .into());
     }
     // Before anything is sent: a file with a mistake in it sends nothing.
     let contents = contents(&args.file)?;
-    let mut ctx = observe(&find(args.which.stack.as_deref())?)?;
+    let mut ctx = super::join(args.which.stack.as_deref())?;
     let names = Names::of(&ctx.stack);
     let filter = Filter::parse(&args.filter.filter, &names)?;
     let targets = targets(&contents, &super::all_buses(&ctx), args.bus.as_deref(), &args.map)?;
@@ -40,7 +43,17 @@ pub fn run(args: &ReplayArgs, json: bool) -> anyhow::Result<ExitCode> {
     let mut reactor = Reactor::new()?;
     let stop = reactor.add(ctx.shutdown_fd())?;
     let clock = Clock::new(args, &contents);
-    let mut player = Player { args, filter, targets, senders, reactor, stop, clock, left_out: LeftOut::default(), looks: 0 };
+    let mut player = Player {
+        args,
+        filter,
+        targets,
+        senders,
+        reactor,
+        stop,
+        clock,
+        left_out: LeftOut::default(),
+        looks: 0,
+    };
     let begin = Instant::now();
     let played = player.play()?;
     let mut why = match played {
@@ -79,7 +92,10 @@ fn targets(
     if !map.is_empty() {
         for entry in map {
             let Some((from, to)) = entry.split_once('=') else {
-                return Err(UsageError(format!("--map '{entry}' must be LOGGED=BUS, for example can0=vcan0")).into());
+                return Err(UsageError(format!(
+                    "--map '{entry}' must be LOGGED=BUS, for example can0=vcan0"
+                ))
+                .into());
             };
             if !contents.buses.contains_key(from) {
                 let near = nearest(from, contents.order.iter().map(String::as_str));
@@ -202,7 +218,8 @@ impl Player<'_> {
     /// Number of the sender that a frame goes to.
     fn wanted(&mut self, bus: &str, frame: &CanFrame) -> Option<usize> {
         let target = self.targets.get(bus);
-        let taken = !(self.args.received_only && frame.flags & can_flag::TX_ECHO != 0) && self.filter.takes(bus, frame);
+        let taken = !(self.args.received_only && frame.flags & can_flag::TX_ECHO != 0)
+            && self.filter.takes(bus, frame);
         if let (Some(target), true) = (target, taken) {
             if !frame.is_error() {
                 return self.senders.iter().position(|(name, _)| name == target);
@@ -237,7 +254,9 @@ impl Player<'_> {
             // Asking for signals costs a system call: not at every look of a short wait.
             self.looks = self.looks.wrapping_add(1);
             let asked = early.min(Duration::from_millis(1)).saturating_sub(Duration::from_micros(100));
-            if (!asked.is_zero() || self.looks.is_multiple_of(64)) && self.reactor.wait(Some(asked))?.contains(&self.stop) {
+            if (!asked.is_zero() || self.looks.is_multiple_of(64))
+                && self.reactor.wait(Some(asked))?.contains(&self.stop)
+            {
                 return Ok(Some(Played::Stopped));
             }
             if early.is_zero() {
@@ -247,7 +266,8 @@ impl Player<'_> {
     }
 
     fn report(&self, took: Duration, why: Option<&str>, json: bool) -> ExitCode {
-        let each: Vec<(&str, Counts)> = self.senders.iter().map(|(bus, s)| (bus.as_str(), s.counts())).collect();
+        let each: Vec<(&str, Counts)> =
+            self.senders.iter().map(|(bus, s)| (bus.as_str(), s.counts())).collect();
         let whole = why.is_none() && each.iter().all(|(_, c)| c.echoed == c.sent && c.out_of_order == 0);
         if json {
             let buses: BTreeMap<&str, Counts> = each.iter().copied().collect();
@@ -255,15 +275,15 @@ impl Player<'_> {
                 "file": self.args.file, "seconds": took.as_secs_f64(), "whole": whole,
                 "buses": buses, "left_out": self.left_out,
             });
-            println(&value.to_string());
+            super::put(&format!("{value}\n"));
         } else {
             for (bus, counts) in &each {
-                println(&text(bus, counts, took.as_secs_f64()));
+                super::put(&(text(bus, counts, took.as_secs_f64()) + "\n"));
             }
             if self.left_out != LeftOut::default() {
                 let LeftOut { error_frames, not_wanted } = self.left_out;
-                println(&format!(
-                    "left out: {error_frames} error frames (controllers make them, nobody can send one), {not_wanted} not asked for"
+                super::put(&format!(
+                    "left out: {error_frames} error frames (controllers make them, nobody can send one), {not_wanted} not asked for\n"
                 ));
             }
         }
@@ -329,12 +349,20 @@ mod tests {
             mapped(&["a"], &["can0"], None, &["a=x"]),
             mapped(&["a"], &["can0"], None, &["a"]),
         ];
-        insta::assert_snapshot!(said.join("\n"), @"");
+        insta::assert_snapshot!(said.join("\n"), @r#"
+the file has frames of a, b, the stack has can0: say where they go with --bus BUS or --map LOGGED=BUS
+the stack has no CAN bus 'cna0' (did you mean 'can0'?); it has can0
+no frame of 'vcan1' in the file (did you mean 'vcan0'?); it has frames of vcan0
+the stack has no CAN bus 'x'; it has can0
+--map 'a' must be LOGGED=BUS, for example can0=vcan0
+"#);
     }
 
     fn clock(args: &str) -> Clock {
         let words = ["dinrail", "can", "replay", "x.log"].into_iter().chain(args.split_whitespace());
-        let Command::Can(CanCommand::Replay(args)) = Cli::try_parse_from(words).unwrap().command else { panic!() };
+        let Command::Can(CanCommand::Replay(args)) = Cli::try_parse_from(words).unwrap().command else {
+            panic!()
+        };
         Clock::new(&args, &contents(&["a"]))
     }
 
@@ -358,7 +386,10 @@ mod tests {
     #[test]
     fn summary() {
         let counts = Counts { sent: 100, echoed: 100, ..Counts::default() };
-        assert_eq!(text("can0", &counts, 2.0), "can0: 100 frames sent in 2.000 s (50/s); every one was seen on the bus, in order");
+        assert_eq!(
+            text("can0", &counts, 2.0),
+            "can0: 100 frames sent in 2.000 s (50/s); every one was seen on the bus, in order"
+        );
         let lost = Counts { echoed: 98, out_of_order: 1, ..counts };
         assert!(text("can0", &lost, 2.0).ends_with("2 were not seen on the bus, 1 out of order"));
     }

@@ -13,9 +13,12 @@ impl Page {
 
     /// Shows these lines, as many as there is room for.
     pub fn draw(&self, lines: &[String]) {
-        let rows = ratatui::crossterm::terminal::size().map_or(24, |(_, rows)| usize::from(rows)).max(2);
+        // Some terminals say 0 when they do not know.
+        let known = ratatui::crossterm::terminal::size().ok().map(|(_, rows)| usize::from(rows));
+        let rows = known.filter(|rows| *rows >= 2).unwrap_or(24);
         let mut text = String::from("\x1b[H");
-        let (shown, more) = if lines.len() > rows { (rows - 1, lines.len() - rows + 1) } else { (lines.len(), 0) };
+        let (shown, more) =
+            if lines.len() > rows { (rows - 1, lines.len() - rows + 1) } else { (lines.len(), 0) };
         for (i, line) in lines[..shown].iter().enumerate() {
             if i > 0 {
                 text.push_str("\r\n");

@@ -5,8 +5,7 @@ use super::flight::Order;
 use super::from_frame;
 use super::sender::Sender;
 use super::show::{Form, Paint, Printer, Time};
-use crate::commands::{UsageError, println};
-use crate::supervise::client::{find, observe};
+use crate::commands::UsageError;
 use dinrail_can::protocol::candump;
 use ipc_types::clock;
 use ipc_types::payload::CanFrame;
@@ -20,11 +19,14 @@ pub fn run(args: &SendArgs, json: bool) -> anyhow::Result<ExitCode> {
     for text in &args.frames {
         let frame = candump::parse(text).map_err(|e| UsageError(e.to_string()))?;
         if frame.is_error() {
-            return Err(UsageError(format!("{text} is an error frame: a controller makes them, nobody can send one")).into());
+            return Err(UsageError(format!(
+                "{text} is an error frame: a controller makes them, nobody can send one"
+            ))
+            .into());
         }
         frames.push(from_frame(&frame));
     }
-    let mut ctx = observe(&find(args.which.stack.as_deref())?)?;
+    let mut ctx = super::join(args.which.stack.as_deref())?;
     let mut sender = Sender::new(&mut ctx, &args.bus, Order::Exact)?;
     let form = if json { Form::Json } else { Form::Log };
     let mut printer = Printer::new(form, Time::Day, false, Paint::PLAIN, None, 0);
@@ -46,7 +48,7 @@ pub fn run(args: &SendArgs, json: bool) -> anyhow::Result<ExitCode> {
         for frame in &frames {
             send_one(&mut sender, frame, |seen| {
                 let utc_ns = (seen.stamp.t_ns as i64 + clock::utc_offset_ns()).max(0) as u64;
-                println(&printer.line(&args.bus, seen, utc_ns));
+                super::put(&(printer.line(&args.bus, seen, utc_ns) + "\n"));
             })?;
         }
     }

@@ -2,7 +2,7 @@
 //! followed until it was on the bus.
 
 use super::flight::{Flight, Order};
-use super::topic;
+use super::{place, topic};
 use dinrail_can::protocol::candump;
 use ipc_types::Context;
 use ipc_types::payload::{CanFrame, can_flag};
@@ -50,8 +50,10 @@ pub struct Sender {
 
 impl Sender {
     pub fn new(ctx: &mut Context, bus: &str, order: Order) -> anyhow::Result<Self> {
-        let rx = ctx.subscriber::<CanFrame>(&topic(ctx, bus, TopicKind::CanRx)?)?;
-        let tx = ctx.publisher::<CanFrame>(&topic(ctx, bus, TopicKind::CanTx)?)?;
+        let (rx, tx) = (topic(ctx, bus, TopicKind::CanRx)?, topic(ctx, bus, TopicKind::CanTx)?);
+        let rx = place(ctx, ctx.subscriber::<CanFrame>(&rx))?;
+        let tx = ctx.publisher::<CanFrame>(&tx);
+        let tx = place(ctx, tx)?;
         // Short waits shall be short. Where it is refused they are a little longer.
         let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(1000));
         Ok(Self {
@@ -145,7 +147,10 @@ impl Sender {
             ));
         }
         self.held_up.then(|| {
-            format!("bus '{}': its driver takes nothing since {seconds} s; `dinrail ps` says how it is", self.bus)
+            format!(
+                "bus '{}': its driver takes nothing since {seconds} s; `dinrail ps` says how it is",
+                self.bus
+            )
         })
     }
 

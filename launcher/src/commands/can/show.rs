@@ -76,7 +76,14 @@ pub struct Printer<'a> {
 }
 
 impl<'a> Printer<'a> {
-    pub fn new(form: Form, time: Time, ascii: bool, paint: Paint, names: Option<&'a Names>, bus_width: usize) -> Self {
+    pub fn new(
+        form: Form,
+        time: Time,
+        ascii: bool,
+        paint: Paint,
+        names: Option<&'a Names>,
+        bus_width: usize,
+    ) -> Self {
         Self { form, time, ascii, paint, names, bus_width, last_ns: None }
     }
 
@@ -213,7 +220,8 @@ mod tests {
     fn frames() -> Vec<CanFrame> {
         let texts =
             ["1A0#B004466F6F0D", "18FEF100#01", "123#R4", "123##3AABB", "7FF#", "20000040#0000000000000000"];
-        let mut frames: Vec<CanFrame> = texts.iter().map(|t| from_frame(&candump::parse(t).unwrap())).collect();
+        let mut frames: Vec<CanFrame> =
+            texts.iter().map(|t| from_frame(&candump::parse(t).unwrap())).collect();
         frames[1].flags = can_flag::TX_ECHO;
         frames
     }
@@ -221,21 +229,60 @@ mod tests {
     fn lines(form: Form, time: Time, ascii: bool, paint: Paint) -> String {
         let names = Names::of_table(&[("can0", 0x1A0, "Speed"), ("can0", 0x1A0, "Torque")]);
         let mut printer = Printer::new(form, time, ascii, paint, Some(&names), 5);
-        let lines = frames().iter().enumerate().map(|(i, f)| printer.line("can0", f, UTC + i as u64 * 1_500_000)).collect::<Vec<_>>();
+        let lines = frames()
+            .iter()
+            .enumerate()
+            .map(|(i, f)| printer.line("can0", f, UTC + i as u64 * 1_500_000))
+            .collect::<Vec<_>>();
         lines.join("\n")
     }
 
     #[test]
     fn for_people() {
-        insta::assert_snapshot!(lines(Form::Screen, Time::Day, false, Paint::PLAIN), @"");
-        insta::assert_snapshot!(lines(Form::Screen, Time::Delta, true, Paint::PLAIN), @"");
-        insta::assert_snapshot!(lines(Form::Screen, Time::Absolute, false, Paint::COLOR).replace('\x1b', "ESC"), @"");
+        insta::assert_snapshot!(lines(Form::Screen, Time::Day, false, Paint::PLAIN), @r#"
+15:06:13.191777  can0            1A0  [ 6]  B0 04 46 6F 6F 0D        Speed Torque
+15:06:13.193277  can0   TX  18FEF100  [ 1]  01
+15:06:13.194777  can0            123  [ 4] RTR
+15:06:13.196277  can0            123  [ 2] FD BRS ESI  AA BB
+15:06:13.197777  can0            7FF  [ 0]
+15:06:13.199277  can0          ERROR  bus-off
+"#);
+        insta::assert_snapshot!(lines(Form::Screen, Time::Delta, true, Paint::PLAIN), @r#"
+(+   0.000000)  can0            1A0  [ 6]  B0 04 46 6F 6F 0D        ..Foo.    Speed Torque
+(+   0.001500)  can0   TX  18FEF100  [ 1]  01                       .
+(+   0.001500)  can0            123  [ 4] RTR
+(+   0.001500)  can0            123  [ 2] FD BRS ESI  AA BB                    ..
+(+   0.001500)  can0            7FF  [ 0]
+(+   0.001500)  can0          ERROR  bus-off
+"#);
+        insta::assert_snapshot!(lines(Form::Screen, Time::Absolute, false, Paint::COLOR).replace('\x1b', "ESC"), @r#"
+ESC[2m(1506783973.191777)ESC[0m  can0   ESC[36m  ESC[0m       1A0  [ 6]  B0 04 46 6F 6F 0D        ESC[32mSpeed TorqueESC[0m
+ESC[2m(1506783973.193277)ESC[0m  can0   ESC[36mTXESC[0m  18FEF100  [ 1]  01
+ESC[2m(1506783973.194777)ESC[0m  can0   ESC[36m  ESC[0m       123  [ 4] ESC[36mRTRESC[0m
+ESC[2m(1506783973.196277)ESC[0m  can0   ESC[36m  ESC[0m       123  [ 2] ESC[36mFD BRS ESIESC[0m  AA BB
+ESC[2m(1506783973.197777)ESC[0m  can0   ESC[36m  ESC[0m       7FF  [ 0]
+ESC[2m(1506783973.199277)ESC[0m  can0   ESC[36m  ESC[0m  ESC[31m   ERROR  bus-offESC[0m
+"#);
     }
 
     #[test]
     fn for_programs() {
-        insta::assert_snapshot!(lines(Form::Log, Time::Day, true, Paint::COLOR), @"");
-        insta::assert_snapshot!(lines(Form::Json, Time::Day, true, Paint::COLOR), @"");
+        insta::assert_snapshot!(lines(Form::Log, Time::Day, true, Paint::COLOR), @r#"
+(1506783973.191777) can0 1A0#B004466F6F0D
+(1506783973.193277) can0 18FEF100#01
+(1506783973.194777) can0 123#R4
+(1506783973.196277) can0 123##3AABB
+(1506783973.197777) can0 7FF#
+(1506783973.199277) can0 20000040#0000000000000000
+"#);
+        insta::assert_snapshot!(lines(Form::Json, Time::Day, true, Paint::COLOR), @r#"
+{"brs":false,"bus":"can0","data":"B004466F6F0D","echo":false,"esi":false,"extended":false,"fd":false,"frame":"1A0#B004466F6F0D","id":416,"len":6,"names":{"Speed":null,"Torque":null},"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.191777Z","utc_ns":1506783973191777888}
+{"brs":false,"bus":"can0","data":"01","echo":true,"esi":false,"extended":true,"fd":false,"frame":"18FEF100#01","id":419361024,"len":1,"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.193277Z","utc_ns":1506783973193277888}
+{"brs":false,"bus":"can0","data":"","echo":false,"esi":false,"extended":false,"fd":false,"frame":"123#R4","id":291,"len":4,"rtr":true,"seq":0,"utc":"2017-09-30T15:06:13.194777Z","utc_ns":1506783973194777888}
+{"brs":true,"bus":"can0","data":"AABB","echo":false,"esi":true,"extended":false,"fd":true,"frame":"123##3AABB","id":291,"len":2,"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.196277Z","utc_ns":1506783973196277888}
+{"brs":false,"bus":"can0","data":"","echo":false,"esi":false,"extended":false,"fd":false,"frame":"7FF#","id":2047,"len":0,"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.197777Z","utc_ns":1506783973197777888}
+{"brs":false,"bus":"can0","data":"0000000000000000","echo":false,"error":"bus-off","esi":false,"extended":false,"fd":false,"frame":"20000040#0000000000000000","id":64,"len":8,"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.199277Z","utc_ns":1506783973199277888}
+"#);
     }
 
     #[test]

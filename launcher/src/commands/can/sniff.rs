@@ -7,8 +7,7 @@ use super::listen::{LOOK, Listener};
 use super::names::Names;
 use super::screen::Page;
 use super::show::{Paint, ascii, flag_words, id_text};
-use crate::commands::{DATA_LOSS, print};
-use crate::supervise::client::{find, observe};
+use crate::commands::DATA_LOSS;
 use ipc_types::clock;
 use ipc_types::payload::CanFrame;
 use ipc_types::reactor::Reactor;
@@ -65,7 +64,8 @@ impl Sniffer {
                 return News::Same;
             }
             let names = names.text(bus, frame);
-            self.rows.insert(key, Row { frame: *frame, frames: 1, period_ns: None, changed_ns: [0; 64], names });
+            self.rows
+                .insert(key, Row { frame: *frame, frames: 1, period_ns: None, changed_ns: [0; 64], names });
             return News::First;
         };
         let t_ns = frame.stamp.t_ns;
@@ -74,7 +74,8 @@ impl Sniffer {
         let (old, new) = (row.frame.payload(), frame.payload());
         let changed: Vec<usize> = (0..new.len()).filter(|i| old.get(*i) != new.get(*i)).collect();
         let same = changed.is_empty()
-            && (row.frame.len, row.frame.fd_flags, row.frame.is_remote()) == (frame.len, frame.fd_flags, frame.is_remote());
+            && (row.frame.len, row.frame.fd_flags, row.frame.is_remote())
+                == (frame.len, frame.fd_flags, frame.is_remote());
         for &i in &changed {
             row.changed_ns[i] = t_ns.max(1);
         }
@@ -90,7 +91,14 @@ impl Sniffer {
     fn line(row: &Row, paint: &Paint, marked: impl Fn(usize) -> bool) -> String {
         let mut line = String::with_capacity(160);
         let period = row.period_ns.map_or("-".to_owned(), |ns| format!("{:.3}", ns as f64 / 1e6));
-        let _ = write!(line, "{}{period:>11}{}  {:>8}  [{:>2}] ", paint.dim, paint.off, id_text(&row.frame), row.frame.len);
+        let _ = write!(
+            line,
+            "{}{period:>11}{}  {:>8}  [{:>2}] ",
+            paint.dim,
+            paint.off,
+            id_text(&row.frame),
+            row.frame.len
+        );
         let flags = flag_words(&row.frame);
         if !flags.is_empty() {
             let _ = write!(line, " {}{flags}{}", paint.cyan, paint.off);
@@ -107,7 +115,15 @@ impl Sniffer {
             let _ = write!(line, "{on}{byte:02X}{off}{plain}");
             width += 3;
         }
-        let _ = write!(line, "{:pad$} {}{}{}", "", paint.dim, ascii(row.frame.payload()), paint.off, pad = 24usize.saturating_sub(width));
+        let _ = write!(
+            line,
+            "{:pad$} {}{}{}",
+            "",
+            paint.dim,
+            ascii(row.frame.payload()),
+            paint.off,
+            pad = 24usize.saturating_sub(width)
+        );
         if !row.names.is_empty() {
             let _ = write!(line, "  {}{}{}", paint.green, row.names, paint.off);
         }
@@ -124,14 +140,17 @@ impl Sniffer {
             lines.push(Self::line(row, paint, |i| row.changed_ns[i] != 0 && row.changed_ns[i] >= since));
         }
         if self.beyond > 0 {
-            lines.push(format!("{} frames of further identifiers: more than {MAX_IDS}; use --filter", self.beyond));
+            lines.push(format!(
+                "{} frames of further identifiers: more than {MAX_IDS}; use --filter",
+                self.beyond
+            ));
         }
         lines
     }
 }
 
 pub fn run(args: &SniffArgs, json: bool) -> anyhow::Result<ExitCode> {
-    let ctx = observe(&find(args.which.stack.as_deref())?)?;
+    let ctx = super::join(args.which.stack.as_deref())?;
     let names = Names::of(&ctx.stack);
     let filter = Filter::parse(&args.filter.filter, &names)?;
     let bus = super::buses(&ctx, std::slice::from_ref(&args.bus))?.swap_remove(0);
@@ -158,9 +177,7 @@ pub fn run(args: &SniffArgs, json: bool) -> anyhow::Result<ExitCode> {
             }
             true
         });
-        if !text.is_empty() {
-            print(&text);
-        }
+        ended |= !text.is_empty() && !super::put(&text);
         if let Some(page) = &page
             && drawn.elapsed() >= REFRESH
         {
@@ -176,7 +193,14 @@ pub fn run(args: &SniffArgs, json: bool) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn news_line(sniffer: &Sniffer, bus: &str, frame: &CanFrame, news: &News, paint: &Paint, json: bool) -> String {
+fn news_line(
+    sniffer: &Sniffer,
+    bus: &str,
+    frame: &CanFrame,
+    news: &News,
+    paint: &Paint,
+    json: bool,
+) -> String {
     let Some(row) = sniffer.rows.get(&(frame.is_extended(), frame.id())) else { return String::new() };
     let none = Vec::new();
     let changed = if let News::Changed(changed) = news { changed } else { &none };
@@ -218,8 +242,19 @@ mod tests {
                 lines.push(news_line(&sniffer, "can0", &frame, &news, &Paint::PLAIN, false));
             }
         }
-        insta::assert_snapshot!(lines.join("\n"), @"");
-        insta::assert_snapshot!(sniffer.page("can0", &Paint::COLOR, 1_100_000_000).join("\n").replace('\x1b', "ESC"), @"");
+        insta::assert_snapshot!(lines.join("\n"), @r#"
+     -       123  [ 3]  41 00 FF                 A..  Speed
+10.000       123  [ 3]  41 01*FE*                A..  Speed
+     -  00000123  [ 2]  RTR
+20.000       123  [ 1]  41                       A  Speed
+10.000       123  [12]  FD BRS 41 42*43*44*45*46*47*48*49*4A*4B*4C* ABCDEFGHIJKL  Speed
+"#);
+        insta::assert_snapshot!(sniffer.page("can0", &Paint::COLOR, 1_100_000_000).join("\n").replace('\x1b', "ESC"), @r#"
+can0: 2 identifiers, 6 frames; Ctrl-C ends
+  period ms        id  len   data
+ESC[2m     10.000ESC[0m       123  [12]  ESC[36mFD BRSESC[0m 41 ESC[1;7m42ESC[0m ESC[1;7m43ESC[0m ESC[1;7m44ESC[0m ESC[1;7m45ESC[0m ESC[1;7m46ESC[0m ESC[1;7m47ESC[0m ESC[1;7m48ESC[0m ESC[1;7m49ESC[0m ESC[1;7m4AESC[0m ESC[1;7m4BESC[0m ESC[1;7m4CESC[0m  ESC[2mABCDEFGHIJKLESC[0m  ESC[32mSpeedESC[0m
+ESC[2m          -ESC[0m  00000123  [ 2]  ESC[36mRTRESC[0m                          ESC[2mESC[0m
+"#);
     }
 
     #[test]

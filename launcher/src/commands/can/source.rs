@@ -31,8 +31,19 @@ pub struct Logged {
 }
 
 enum Kind {
-    Log { file: BufReader<File>, reader: Reader, number: u64, line: Vec<u8> },
-    Recording { recording: Box<Recording>, merge: Option<Merge<Logged>>, buses: Vec<String>, newest_ns: u64, ended: bool },
+    Log {
+        file: BufReader<File>,
+        reader: Reader,
+        number: u64,
+        line: Vec<u8>,
+    },
+    Recording {
+        recording: Box<Recording>,
+        merge: Option<Merge<Logged>>,
+        buses: Vec<String>,
+        newest_ns: u64,
+        ended: bool,
+    },
 }
 
 /// A file being read.
@@ -45,7 +56,11 @@ impl Source {
     pub fn open(path: &Path) -> anyhow::Result<Self> {
         let cannot = |e: std::io::Error| anyhow::anyhow!("cannot read {}: {e}", path.display());
         let file = File::open(path).map_err(cannot)?;
-        anyhow::ensure!(!file.metadata().map_err(cannot)?.is_dir(), "{} is a folder: name a file in it", path.display());
+        anyhow::ensure!(
+            !file.metadata().map_err(cannot)?.is_dir(),
+            "{} is a folder: name a file in it",
+            path.display()
+        );
         let mut file = BufReader::with_capacity(256 * 1024, file);
         let kind = if file.fill_buf().map_err(cannot)?.starts_with(MCAP_MAGIC) {
             let recording = Box::new(Recording::open(path)?);

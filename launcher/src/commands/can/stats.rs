@@ -8,8 +8,7 @@ use super::names::Names;
 use super::screen::Page;
 use super::show::id_text;
 use super::to_frame;
-use crate::commands::{DATA_LOSS, print, println, table};
-use crate::supervise::client::{find, observe};
+use crate::commands::{DATA_LOSS, table};
 use dinrail_can::protocol::busload::{Stuffing, bits};
 use ipc_types::payload::{CanFrame, can_flag, id_flag};
 use ipc_types::reactor::Reactor;
@@ -140,11 +139,23 @@ impl Stats {
             .rows
             .iter()
             .map(|((bus, extended, id), row)| {
-                let periods = row.periods().map_or(["-", "-", "-"].map(str::to_owned), |p| p.map(|ms| format!("{ms:.3}")));
+                let periods = row
+                    .periods()
+                    .map_or(["-", "-", "-"].map(str::to_owned), |p| p.map(|ms| format!("{ms:.3}")));
                 let [min, mean, max] = periods;
                 let rate = format!("{:.1}", row.frames as f64 / seconds);
                 let len = lengths(row);
-                vec![self.buses[*bus].name.clone(), id_of(*extended, *id), row.frames.to_string(), rate, min, mean, max, len, row.names.clone()]
+                vec![
+                    self.buses[*bus].name.clone(),
+                    id_of(*extended, *id),
+                    row.frames.to_string(),
+                    rate,
+                    min,
+                    mean,
+                    max,
+                    len,
+                    row.names.clone(),
+                ]
             })
             .collect();
         if !ids.is_empty() {
@@ -189,7 +200,11 @@ impl Stats {
 }
 
 fn lengths(row: &Row) -> String {
-    if row.shortest == row.longest { row.longest.to_string() } else { format!("{}-{}", row.shortest, row.longest) }
+    if row.shortest == row.longest {
+        row.longest.to_string()
+    } else {
+        format!("{}-{}", row.shortest, row.longest)
+    }
 }
 
 fn id_of(extended: bool, id: u32) -> String {
@@ -207,7 +222,7 @@ fn rates(stack: &Stack, bus: &str) -> Option<(u32, u32)> {
 }
 
 pub fn run(args: &StatsArgs, json: bool) -> anyhow::Result<ExitCode> {
-    let ctx = observe(&find(args.which.stack.as_deref())?)?;
+    let ctx = super::join(args.which.stack.as_deref())?;
     let names = Names::of(&ctx.stack);
     let filter = Filter::parse(&args.filter.filter, &names)?;
     let buses = super::buses(&ctx, &args.buses)?;
@@ -244,9 +259,9 @@ pub fn run(args: &StatsArgs, json: bool) -> anyhow::Result<ExitCode> {
     drop(page);
     let seconds = begin.elapsed().as_secs_f64();
     if json {
-        println(&stats.json(seconds).to_string());
+        super::put(&format!("{}\n", stats.json(seconds)));
     } else {
-        print(&stats.text(seconds));
+        super::put(&stats.text(seconds));
     }
     if let Some(text) = listener.loss_text() {
         eprintln!("dinrail: {text}");
@@ -265,10 +280,17 @@ mod tests {
     fn rates_periods_and_load() {
         let names = Names::of_table(&[("can0", 0x123, "Speed")]);
         let bus = |name: &str, rates| Bus { name: name.into(), rates, ..Bus::default() };
-        let mut stats = Stats { buses: vec![bus("can0", Some((500_000, 2_000_000))), bus("far", None)], ..Stats::default() };
+        let mut stats = Stats {
+            buses: vec![bus("can0", Some((500_000, 2_000_000))), bus("far", None)],
+            ..Stats::default()
+        };
         let mut add = |bus, ms: u64, text: &str, flags| {
             let stamp = Stamp { t_ns: ms * 1_000_000, ..Stamp::default() };
-            stats.add(bus, &CanFrame { stamp, flags, ..super::super::from_frame(&parse(text).unwrap()) }, &names);
+            stats.add(
+                bus,
+                &CanFrame { stamp, flags, ..super::super::from_frame(&parse(text).unwrap()) },
+                &names,
+            );
         };
         for (i, ms) in [0, 10, 30, 45].into_iter().enumerate() {
             add(0, ms, ["123#11", "123#1122"][i % 2], 0);
@@ -276,18 +298,110 @@ mod tests {
         add(0, 50, "00000123#R", can_flag::TX_ECHO);
         add(0, 60, "20000040#0000000000000000", 0);
         add(1, 70, "7FF##1AA", 0);
-        insta::assert_snapshot!(stats.text(0.5), @"");
-        insta::assert_snapshot!(format!("{:#}", stats.json(0.5)), @"");
+        insta::assert_snapshot!(stats.text(0.5), @r#"
+bus   frames  frames/s  load   sent by us  RTR  FD  errors  not seen
+can0  5       10.0      0.1 %  1           1    0   1       0
+far   1       2.0       -      0           0    1   0       0
+
+bus   id        frames  frames/s  min ms  mean ms  max ms  len  names
+can0  123       4       8.0       10.000  15.000   20.000  1-2  Speed
+can0  00000123  1       2.0       -       -        -       0
+far   7FF       1       2.0       -       -        -       1
+"#);
+        insta::assert_snapshot!(format!("{:#}", stats.json(0.5)), @r#"
+{
+  "buses": [
+    {
+      "bitrate": 500000,
+      "bus": "can0",
+      "errors": 1,
+      "fd": 0,
+      "frames": 5,
+      "frames_per_s": 10.0,
+      "load_percent": 0.1252,
+      "lost": 0,
+      "rtr": 1,
+      "sent": 1
+    },
+    {
+      "bitrate": null,
+      "bus": "far",
+      "errors": 0,
+      "fd": 1,
+      "frames": 1,
+      "frames_per_s": 2.0,
+      "load_percent": null,
+      "lost": 0,
+      "rtr": 0,
+      "sent": 0
+    }
+  ],
+  "ids": [
+    {
+      "bus": "can0",
+      "extended": false,
+      "frames": 4,
+      "frames_per_s": 8.0,
+      "id": 291,
+      "id_text": "123",
+      "len_max": 2,
+      "len_min": 1,
+      "names": "Speed",
+      "period_max_ms": 20.0,
+      "period_mean_ms": 15.0,
+      "period_min_ms": 10.0,
+      "sent": 0
+    },
+    {
+      "bus": "can0",
+      "extended": true,
+      "frames": 1,
+      "frames_per_s": 2.0,
+      "id": 291,
+      "id_text": "00000123",
+      "len_max": 0,
+      "len_min": 0,
+      "names": "",
+      "period_max_ms": null,
+      "period_mean_ms": null,
+      "period_min_ms": null,
+      "sent": 1
+    },
+    {
+      "bus": "far",
+      "extended": false,
+      "frames": 1,
+      "frames_per_s": 2.0,
+      "id": 2047,
+      "id_text": "7FF",
+      "len_max": 1,
+      "len_min": 1,
+      "names": "",
+      "period_max_ms": null,
+      "period_mean_ms": null,
+      "period_min_ms": null,
+      "sent": 0
+    }
+  ],
+  "ids_complete": true,
+  "seconds": 0.5
+}
+"#);
     }
 
     #[test]
     fn identifiers_have_a_limit() {
-        let mut stats = Stats { buses: vec![Bus { name: "can0".into(), ..Bus::default() }], ..Stats::default() };
+        let mut stats =
+            Stats { buses: vec![Bus { name: "can0".into(), ..Bus::default() }], ..Stats::default() };
         for id in 0..=MAX_IDS as u32 {
             let frame = CanFrame { can_id: id_flag::EFF | id, ..CanFrame::default() };
             stats.add(0, &frame, &Names::default());
         }
         assert_eq!((stats.rows.len(), stats.buses[0].frames), (MAX_IDS, MAX_IDS as u64 + 1));
-        assert!(stats.text(1.0).ends_with("more than 16384 identifiers: the others are not listed; use --filter\n"));
+        assert!(
+            stats
+                .text(1.0)
+                .ends_with("more than 16384 identifiers: the others are not listed; use --filter\n")
+        );
     }
 }

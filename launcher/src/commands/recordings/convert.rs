@@ -77,11 +77,16 @@ pub fn renamed(asked: &[String], there: &[String]) -> anyhow::Result<Vec<(String
             (None, [only]) => (only.as_str(), text.as_str()),
             (None, _) => {
                 let many = there.join(", ");
-                return Err(UsageError(format!("--bus '{text}': the log has frames of {many}; write LOGGED={text}")).into());
+                return Err(UsageError(format!(
+                    "--bus '{text}': the log has frames of {many}; write LOGGED={text}"
+                ))
+                .into());
             }
         };
         if to.is_empty() || !to.bytes().all(|c| c.is_ascii_alphanumeric() || matches!(c, b'_' | b'-')) {
-            return Err(UsageError(format!("--bus '{text}': a bus has a name of letters, digits, _ and -")).into());
+            return Err(
+                UsageError(format!("--bus '{text}': a bus has a name of letters, digits, _ and -")).into()
+            );
         }
         let Some(entry) = names.iter_mut().find(|(logged, _)| logged == from) else {
             anyhow::bail!(unknown(from, there));
@@ -97,7 +102,11 @@ pub fn create(path: &Path, input: &Path, force: bool) -> anyhow::Result<File> {
     anyhow::ensure!(!same, "{} is the input itself: name another output", path.display());
     let mut options = File::options();
     options.read(true).write(true);
-    let opened = if force { options.create(true).truncate(true).open(path) } else { options.create_new(true).open(path) };
+    let opened = if force {
+        options.create(true).truncate(true).open(path)
+    } else {
+        options.create_new(true).open(path)
+    };
     opened.map_err(|e| match e.kind() {
         std::io::ErrorKind::AlreadyExists => {
             anyhow::anyhow!("{} is there already: name another output, or give --force", path.display())
@@ -120,7 +129,10 @@ mod tests {
         assert_eq!(chosen(&[], &there).unwrap(), None);
         assert_eq!(chosen(&list(&["can1/rx"]), &there).unwrap(), Some(list(&["can1"])));
         let said = chosen(&list(&["cna1"]), &there).unwrap_err().to_string();
-        assert_eq!(said, "no frame of 'cna1' in the file (did you mean 'can1'?); it has frames of can0, can1");
+        assert_eq!(
+            said,
+            "no frame of 'cna1' in the file (did you mean 'can1'?); it has frames of can0, can1"
+        );
     }
 
     #[test]
@@ -132,8 +144,14 @@ mod tests {
         assert_eq!(names(&[], &["a", "b"]), "a>a b>b");
         assert_eq!(names(&["can0"], &["vcan0"]), "vcan0>can0");
         assert_eq!(names(&["b=can1"], &["a", "b"]), "a>a b>can1");
-        assert_eq!(names(&["can0"], &["a", "b"]), "--bus 'can0': the log has frames of a, b; write LOGGED=can0");
-        assert_eq!(names(&["c=x"], &["a"]), "no frame of 'c' in the file; it has frames of a");
+        assert_eq!(
+            names(&["can0"], &["a", "b"]),
+            "--bus 'can0': the log has frames of a, b; write LOGGED=can0"
+        );
+        assert_eq!(
+            names(&["c=x"], &["a"]),
+            "no frame of 'c' in the file (did you mean 'a'?); it has frames of a"
+        );
         assert_eq!(names(&["a b"], &["a"]), "--bus 'a b': a bus has a name of letters, digits, _ and -");
     }
 }

@@ -66,7 +66,8 @@ pub fn run(args: &ExportArgs, json: bool) -> anyhow::Result<ExitCode> {
     let wanted = chosen(&args.bus, &contents.order)?;
     let buses = wanted.unwrap_or_else(|| contents.order.clone());
     let by_ending = || {
-        let asc = args.output.as_ref().and_then(|p| p.extension()).is_some_and(|e| e.eq_ignore_ascii_case("asc"));
+        let asc =
+            args.output.as_ref().and_then(|p| p.extension()).is_some_and(|e| e.eq_ignore_ascii_case("asc"));
         if asc { LogFormat::Asc } else { LogFormat::Candump }
     };
     let format = args.format.unwrap_or_else(by_ending);

@@ -20,7 +20,10 @@ pub fn run(args: &ImportArgs, json: bool) -> anyhow::Result<ExitCode> {
     let contents = contents(&args.file)?;
     let mut source = Source::open(&args.file)?;
     if source.is_recording() {
-        anyhow::bail!("{} is a recording already; `dinrail recordings info` shows what is in it", args.file.display());
+        anyhow::bail!(
+            "{} is a recording already; `dinrail recordings info` shows what is in it",
+            args.file.display()
+        );
     }
     let names = renamed(&args.bus, &contents.order)?;
     // Only now: a log with a mistake in it leaves no file behind.

@@ -121,8 +121,7 @@ fn foot_line(model: &Model) -> Line<'static> {
     Line::styled(keys, Modifier::DIM)
 }
 
-const HELP: &str = "\
- Up Down j k   select a service, or scroll
+const HELP: &str = " Up Down j k   select a service, or scroll
  r             restart the selected service (asks)
  l Enter       its log
  e             events
@@ -140,19 +139,22 @@ const HELP: &str = "\
 
 fn main_view(model: &Model, frame: &mut Frame<'_>, area: Rect) {
     let services = sections::services(model);
-    let others: Vec<Section> = [
+    let filled = |all: Vec<Section>| all.into_iter().filter(|s| !s.rows.is_empty()).collect::<Vec<_>>();
+    let mut others = filled(vec![
         sections::buses(model),
         sections::plcs(model),
         sections::recorders(model),
         sections::others(model),
-        sections::clients(model),
-        sections::points(model),
-    ]
-    .into_iter()
-    .filter(|s| !s.rows.is_empty())
-    .collect();
+    ]);
+    let vital = others.len();
+    others.extend(filled(vec![sections::clients(model), sections::points(model)]));
     let wants: Vec<u16> = others.iter().map(|s| s.rows.len() as u16 + 1).collect();
-    let heights = share(area.height, services.rows.len() as u16 + 1, &wants, model.events.len() as u16 + 1);
+    let heights = share(
+        area.height,
+        services.rows.len() as u16 + 1,
+        wants.split_at(vital),
+        model.events.len() as u16 + 1,
+    );
     let mut top = area.y;
     let mut place = |height: u16| {
         let part = Rect { x: area.x, y: top, width: area.width, height };
@@ -161,11 +163,11 @@ fn main_view(model: &Model, frame: &mut Frame<'_>, area: Rect) {
     };
     let mut state = TableState::new().with_selected(Some(model.selected));
     let part = place(heights.services);
-    frame.render_stateful_widget(table(&services, true), part, &mut state);
+    frame.render_stateful_widget(table(&services, part, true), part, &mut state);
     for (section, height) in others.iter().zip(heights.others) {
         let part = place(height);
         if height > 0 {
-            frame.render_widget(table(section, false), part);
+            frame.render_widget(table(section, part, false), part);
         }
     }
     let part = place(heights.events);
@@ -184,9 +186,9 @@ struct Heights {
     events: u16,
 }
 
-/// Who gets how many of the rows: services first, then of every section its head and one row, some events, then
-/// every section what it wants, and the events what is left.
-fn share(total: u16, services: u16, wants: &[u16], events: u16) -> Heights {
+/// Who gets how many of the rows: services first, then the vital sections whole, then some events, then of every
+/// other section its head and one row, then these what they want, and the events what is left.
+fn share(total: u16, services: u16, (vital, rest): (&[u16], &[u16]), events: u16) -> Heights {
     let mut left = total;
     let mut take = |want: u16, least: u16| {
         let taken = if left < least { 0 } else { want.min(left) };
@@ -194,32 +196,55 @@ fn share(total: u16, services: u16, wants: &[u16], events: u16) -> Heights {
         taken
     };
     let services = take(services, 1);
-    let mut others: Vec<u16> = wants.iter().map(|want| take((*want).min(2), 2)).collect();
+    let mut others: Vec<u16> = vital.iter().map(|want| take(*want, 2)).collect();
     let mut events_get = take(events.clamp(2, EVENT_ROWS), 2);
-    for (other, want) in others.iter_mut().zip(wants).filter(|(other, _)| **other > 0) {
-        *other += take(want - *other, 0);
+    let mut more: Vec<u16> = rest.iter().map(|want| take((*want).min(2), 2)).collect();
+    for (has, want) in more.iter_mut().zip(rest).filter(|(has, _)| **has > 0) {
+        *has += take(want - *has, 0);
     }
     if events_get > 0 {
         events_get += take(events.saturating_sub(events_get), 0);
     }
+    others.append(&mut more);
     Heights { services, others, events: events_get }
 }
 
-/// Columns as wide as their contents; the last one gets the rest of the line.
-fn table(section: &Section, selectable: bool) -> Table<'static> {
-    let columns = section.head.len();
+/// Columns as wide as their contents; those that do not fit are left out from the right, the last one gets the rest
+/// of the line. A table that is cut says so in its head.
+fn table(section: &Section, area: Rect, selectable: bool) -> Table<'static> {
+    const MARK: usize = 2;
+    const SPACE: usize = 2;
+    const CUT_LEAST: usize = 8;
+    let (total, fits) = (section.rows.len(), usize::from(area.height.saturating_sub(1)));
+    let mut head: Vec<String> = section.head.iter().map(|h| h.trim().to_owned()).collect();
+    if fits < total && !selectable {
+        head[0] += &format!(" {fits}/{total}");
+    }
     let width = |i: usize| {
         let cells = section.rows.iter().filter_map(|r| r.get(i)).map(|c| c.text.chars().count());
-        cells.chain([section.head[i].trim().chars().count()]).max().unwrap_or(0)
+        cells.chain([head[i].chars().count()]).max().unwrap_or(0)
     };
-    let widths: Vec<usize> = (0..columns).map(width).collect();
+    let mut widths: Vec<usize> = (0..head.len()).map(width).collect();
+    let (mut start, mut columns) = (MARK, 0);
+    for w in &widths {
+        let room = usize::from(area.width).saturating_sub(start);
+        // The last column is a file name or a sentence: its beginning is worth something.
+        if *w > room && (columns + 1 < widths.len() || room < CUT_LEAST) {
+            break;
+        }
+        columns += 1;
+        start += w + SPACE;
+    }
+    let columns = columns.max(1);
+    widths.truncate(columns);
     let pad = |i: usize, text: &str| {
         if section.head[i].starts_with(' ') { format!("{text:>w$}", w = widths[i]) } else { text.to_owned() }
     };
     let rows = section.rows.iter().map(|row| {
-        Row::new(row.iter().enumerate().map(|(i, c)| Span::styled(pad(i, &c.text), c.mood.style())))
+        let cells = row.iter().take(columns).enumerate();
+        Row::new(cells.map(|(i, c)| Span::styled(pad(i, &c.text), c.mood.style())).collect::<Vec<_>>())
     });
-    let head: Vec<String> = section.head.iter().enumerate().map(|(i, h)| pad(i, h.trim())).collect();
+    let head: Vec<String> = head.iter().take(columns).enumerate().map(|(i, h)| pad(i, h)).collect();
     let constraints: Vec<Constraint> = widths
         .iter()
         .enumerate()
@@ -228,7 +253,7 @@ fn table(section: &Section, selectable: bool) -> Table<'static> {
     let symbol = if selectable { "> " } else { "  " };
     Table::new(rows.collect::<Vec<_>>(), constraints)
         .header(Row::new(head).style(Modifier::BOLD))
-        .column_spacing(2)
+        .column_spacing(SPACE as u16)
         .row_highlight_style(Modifier::REVERSED)
         .highlight_symbol(symbol)
         .highlight_spacing(ratatui::widgets::HighlightSpacing::Always)
@@ -269,7 +294,17 @@ fn log_lines(model: &Model) -> Vec<Line<'static>> {
 
 /// Text that cannot steer the terminal.
 pub fn printable(text: &str) -> String {
-    text.chars().map(|c| if c == '\t' { ' ' } else if c.is_control() { '\u{fffd}' } else { c }).collect()
+    text.chars()
+        .map(|c| {
+            if c == '\t' {
+                ' '
+            } else if c.is_control() {
+                '\u{fffd}'
+            } else {
+                c
+            }
+        })
+        .collect()
 }
 
 /// The last lines, less so many.
@@ -294,14 +329,22 @@ mod tests {
 
     #[test]
     fn rows_are_shared_by_rank() {
-        let heights = |services, others: &[u16], events| Heights { services, others: others.to_vec(), events };
-        assert_eq!(share(40, 6, &[2, 2, 5], 3), heights(6, &[2, 2, 5], 4));
-        assert_eq!(share(22, 6, &[3, 2, 9], 50), heights(6, &[3, 2, 7], 4));
-        assert_eq!(share(40, 6, &[3, 2, 9], 50), heights(6, &[3, 2, 9], 20));
-        assert_eq!(share(9, 6, &[3, 2], 50), heights(6, &[2, 0], 0));
-        assert_eq!(share(4, 6, &[3, 2], 50), heights(4, &[0, 0], 0));
+        let heights =
+            |services, others: &[u16], events| Heights { services, others: others.to_vec(), events };
+        let vital: &[u16] = &[3, 2];
+        assert_eq!(share(40, 6, (vital, &[5]), 3), heights(6, &[3, 2, 5], 3));
+        assert_eq!(
+            share(40, 6, (vital, &[5]), 1),
+            heights(6, &[3, 2, 5], 2),
+            "room to say that there is none"
+        );
+        assert_eq!(share(22, 6, (vital, &[9]), 50), heights(6, &[3, 2, 7], 4));
+        assert_eq!(share(40, 6, (vital, &[9]), 50), heights(6, &[3, 2, 9], 20));
+        assert_eq!(share(10, 6, (vital, &[9]), 50), heights(6, &[3, 0, 0], 0));
+        assert_eq!(share(13, 6, (vital, &[9]), 50), heights(6, &[3, 2, 0], 2));
+        assert_eq!(share(4, 6, (vital, &[9]), 50), heights(4, &[0, 0, 0], 0));
         for total in 0..60 {
-            let h = share(total, 6, &[2, 3, 10, 2], 7);
+            let h = share(total, 6, (&[2, 3], &[10, 2]), 7);
             assert!(h.services + h.others.iter().sum::<u16>() + h.events <= total);
         }
     }

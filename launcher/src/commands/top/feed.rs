@@ -192,8 +192,7 @@ impl Feed {
 
     /// The last lines of a service's log.
     pub fn log(&mut self, service: &str) -> Result<Vec<LogLine>, FeedError> {
-        let request =
-            Request::Logs { service: Some(service.to_owned()), lines: LOG_LINES, follow: false };
+        let request = Request::Logs { service: Some(service.to_owned()), lines: LOG_LINES, follow: false };
         self.client.ask(&request)?;
         let mut lines = Vec::new();
         loop {

@@ -11,7 +11,8 @@ const ROW: usize = 16;
 pub fn lines(model: &Model) -> Vec<Line<'static>> {
     let mut lines = Vec::new();
     for shot in &model.now.images {
-        let head = format!("{}  scan {}  {}", shot.plc, shot.scan, format!("{:?}", shot.state).to_lowercase());
+        let head =
+            format!("{}  scan {}  {}", shot.plc, shot.scan, format!("{:?}", shot.state).to_lowercase());
         lines.push(Line::styled(head, Modifier::BOLD));
         let symbols = shot.points.iter().map(|p| p.symbol.as_deref().unwrap_or("-").chars().count());
         let wide = symbols.max().unwrap_or(0);

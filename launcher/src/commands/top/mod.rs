@@ -107,7 +107,9 @@ impl Screen {
         let Some(feed) = &mut self.feed else { return };
         match feed.look() {
             // Another launcher in the place of the one that was joined: everything on the rail is new.
-            Ok(snapshot) if snapshot.stack.as_ref().is_some_and(|s| s.pid != self.stack.pid) => self.feed = None,
+            Ok(snapshot) if snapshot.stack.as_ref().is_some_and(|s| s.pid != self.stack.pid) => {
+                self.feed = None
+            }
             Ok(snapshot) => {
                 self.model.take(snapshot);
                 if let View::Log(service) = self.model.view.clone() {
@@ -116,7 +118,8 @@ impl Screen {
             }
             Err(_) => {
                 self.feed = None;
-                let text = format!("stack '{}' is down; waiting for it to come back, q ends", self.stack.stack);
+                let text =
+                    format!("stack '{}' is down; waiting for it to come back, q ends", self.stack.stack);
                 self.model.lose(text);
             }
         }

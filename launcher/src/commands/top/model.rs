@@ -119,8 +119,7 @@ impl Model {
     /// How fast a counter of a service's status grows, per second. `None` before there are two statuses of one
     /// process.
     pub fn rate(&self, service: &str, counter: &str) -> Option<f64> {
-        let (new, old) =
-            (self.now.told.iter().find(|t| t.service == service)?, self.before.get(service)?);
+        let (new, old) = (self.now.told.iter().find(|t| t.service == service)?, self.before.get(service)?);
         if new.generation != old.generation {
             return None;
         }

@@ -17,7 +17,10 @@ fn kind_of<'a>(model: &'a Model, service: &str) -> &'a str {
 }
 
 /// Name and last status of every service of these kinds.
-fn told<'a>(model: &'a Model, wanted: impl Fn(&str) -> bool + 'a) -> impl Iterator<Item = (&'a str, &'a Value)> {
+fn told<'a>(
+    model: &'a Model,
+    wanted: impl Fn(&str) -> bool + 'a,
+) -> impl Iterator<Item = (&'a str, &'a Value)> {
     model
         .now
         .told
@@ -103,8 +106,7 @@ pub fn buses(model: &Model) -> Section {
             bus_state(s),
         ]
     });
-    let head =
-        vec!["BUS", "BACKEND", " LOAD %", " RX/s", " TX/s", " DROPS", " ERRORS", " TEC/REC", "STATE"];
+    let head = vec!["BUS", "BACKEND", " LOAD %", " RX/s", " TX/s", " DROPS", " ERRORS", " TEC/REC", "STATE"];
     Section { head, rows: rows.collect() }
 }
 
@@ -131,8 +133,7 @@ pub fn plcs(model: &Model) -> Section {
             "fault" => Mood::Bad,
             _ => Mood::Warning,
         };
-        let micros =
-            |path: &str| number(s, path).map_or_else(|| NONE.to_owned(), |n| format!("{n:.0}"));
+        let micros = |path: &str| number(s, path).map_or_else(|| NONE.to_owned(), |n| format!("{n:.0}"));
         let program = match s.get("program").and_then(Value::as_array) {
             Some(files) if !files.is_empty() => {
                 files.iter().filter_map(Value::as_str).collect::<Vec<_>>().join(" ")
@@ -188,8 +189,11 @@ pub fn clients(model: &Model) -> Section {
                 (Some(address), Some(port)) => format!("{address}:{port:.0}"),
                 _ => text(client, "peer").unwrap_or(NONE).to_owned(),
             };
-            let seconds =
-                |path: &str| number(client, path).map_or_else(|| NONE.to_owned(), |n| uptime(n as u64 * 1000));
+            let seconds = |path: &str| match number(client, path) {
+                None => NONE.to_owned(),
+                Some(n) if n < 1.0 => "0 s".to_owned(),
+                Some(n) => uptime((n as u64).saturating_mul(1000)),
+            };
             rows.push(vec![
                 cell(printable(&peer)),
                 cell(name),
@@ -202,9 +206,8 @@ pub fn clients(model: &Model) -> Section {
             ]);
         }
     }
-    let head = vec![
-        "MODBUS CLIENT", "SERVER", "CONNECTED", "IDLE", " REQUESTS", " EXCEPTIONS", " UNIT", "FUNCTION",
-    ];
+    let head =
+        vec!["MODBUS CLIENT", "SERVER", "CONNECTED", "IDLE", " REQUESTS", " EXCEPTIONS", " UNIT", "FUNCTION"];
     Section { head, rows }
 }
 
@@ -246,4 +249,3 @@ pub fn points(model: &Model) -> Section {
     });
     Section { head: vec!["POINT", "ADDRESS", "TYPE", " VALUE", "SERVICE"], rows: rows.collect() }
 }
-

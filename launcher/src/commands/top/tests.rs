@@ -180,7 +180,8 @@ fn views() {
     model.key(Key::Char('q'));
     model.key(Key::Char('G'));
     model.key(Key::Char('l'));
-    let line = |n: i64| LogLine { utc_ns: NOON + n, service: "modbus".into(), line: format!("line {n}\x1b[2J") };
+    let line =
+        |n: i64| LogLine { utc_ns: NOON + n, service: "modbus".into(), line: format!("line {n}\x1b[2J") };
     model.take_log("modbus", (0..30).map(line).collect());
     model.key(Key::Up);
     insta::assert_snapshot!("log", screen(&model, 60, 6));
@@ -193,7 +194,10 @@ fn a_question_and_a_stack_that_went_down() {
     assert!(screen(&model, 80, 24).contains("restart rec? y/n"));
     model.lose("stack 'demo' is down; waiting for it to come back, q ends".into());
     let shown = screen(&model, 80, 24);
-    assert!(shown.contains("is down; waiting") && !shown.contains("4242") && !shown.contains("y/n"), "{shown}");
+    assert!(
+        shown.contains("is down; waiting") && !shown.contains("4242") && !shown.contains("y/n"),
+        "{shown}"
+    );
 }
 
 #[test]

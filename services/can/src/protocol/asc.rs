@@ -153,7 +153,9 @@ impl Reader {
         let fd = kind.eq_ignore_ascii_case("CANFD");
         let channel = if fd { words.next().unwrap_or_default() } else { kind };
         let Ok(channel) = channel.parse::<u16>() else { return Ok(None) };
-        let Some(found) = (if fd { self.wide(words)? } else { self.classic(words)? }) else { return Ok(None) };
+        let Some(found) = (if fd { self.wide(words)? } else { self.classic(words)? }) else {
+            return Ok(None);
+        };
         self.begun = true;
         let (frame, tx) = found;
         frame.validate()?;
@@ -191,10 +193,7 @@ impl Reader {
     }
 
     /// `Rx ID [NAME] BRS ESI CODE LENGTH BYTES DURATION BITS FLAGS ...` or `Rx ErrorFrame`.
-    fn wide<'a>(
-        &self,
-        mut words: impl Iterator<Item = &'a str>,
-    ) -> Result<Option<(Frame, bool)>, AscError> {
+    fn wide<'a>(&self, mut words: impl Iterator<Item = &'a str>) -> Result<Option<(Frame, bool)>, AscError> {
         let Some(tx) = words.next().and_then(direction) else { return Ok(None) };
         let id = words.next().unwrap_or_default();
         if id.eq_ignore_ascii_case("ErrorFrame") {
@@ -266,11 +265,7 @@ impl Reader {
         code.ok_or_else(|| AscError::Length(short(text)))
     }
 
-    fn bytes<'a>(
-        &self,
-        words: &mut impl Iterator<Item = &'a str>,
-        data: &mut [u8],
-    ) -> Result<(), AscError> {
+    fn bytes<'a>(&self, words: &mut impl Iterator<Item = &'a str>, data: &mut [u8]) -> Result<(), AscError> {
         let announced = data.len();
         for (i, byte) in data.iter_mut().enumerate() {
             let text = words.next().unwrap_or_default();
@@ -395,7 +390,8 @@ impl Writer {
             let _ = write!(line, "{code:x} {len:>2}");
             bytes(&mut line, frame);
             // Duration, bits, flags, CRC and four bit timings.
-            let _ = writeln!(line, " {:>8} {:>4} {flags:>8X} {:>8} {:>8} {:>8} {:>8} {:>8}", 0, 0, 0, 0, 0, 0, 0);
+            let _ =
+                writeln!(line, " {:>8} {:>4} {flags:>8X} {:>8} {:>8} {:>8} {:>8} {:>8}", 0, 0, 0, 0, 0, 0, 0);
         } else {
             let kind = if frame.is_remote() { 'r' } else { 'd' };
             let _ = write!(line, "{channel}  {id:<15} {direction:<4} {kind} {:x}", frame.len);

@@ -81,7 +81,9 @@ fn dates() {
     ] {
         assert_eq!(utc(text), Ok(ms), "{text}");
     }
-    for text in ["", "Sat", "Sat Foo 30 15:06:13 2017", "Sat Sep 31 15:06:13 2017", "Sat Sep 30 25:06:13 2017"] {
+    for text in
+        ["", "Sat", "Sat Foo 30 15:06:13 2017", "Sat Sep 31 15:06:13 2017", "Sat Sep 30 25:06:13 2017"]
+    {
         assert!(utc(text).is_err(), "{text}");
     }
 }

@@ -175,9 +175,7 @@ pub fn parse_log_line(line: &str) -> Result<Option<LogLine<'_>>, ParseError> {
 
 fn parse_stamp(text: &str) -> Result<u64, ParseError> {
     let inner = text.strip_prefix('(').and_then(|t| t.strip_suffix(')'));
-    inner
-        .and_then(super::logfile::seconds)
-        .ok_or_else(|| ParseError::Stamp(text.chars().take(40).collect()))
+    inner.and_then(super::logfile::seconds).ok_or_else(|| ParseError::Stamp(text.chars().take(40).collect()))
 }
 
 /// One line as `candump -L` writes it, without line end.

@@ -18,7 +18,11 @@ fn month_days(year: i32, month: u32) -> u32 {
 
 /// Days from 1970-01-01 to a date; `None` for what is no date or lies before 1970 or behind 2500.
 pub(super) fn days(year: i32, month: u32, day: u32) -> Option<u64> {
-    if !(1970..=2500).contains(&year) || !(1..=12).contains(&month) || day == 0 || day > month_days(year, month) {
+    if !(1970..=2500).contains(&year)
+        || !(1..=12).contains(&month)
+        || day == 0
+        || day > month_days(year, month)
+    {
         return None;
     }
     let years: u64 = (1970..year).map(|y| 365 + u64::from(is_leap(y))).sum();
@@ -55,7 +59,8 @@ mod tests {
         assert_eq!(days(1970, 1, 1), Some(0));
         assert_eq!(days(2017, 9, 30), Some(17_439));
         assert_eq!(days(2000, 2, 29), Some(11_016));
-        for (year, month, day) in [(1969, 12, 31), (2100, 2, 29), (2017, 13, 1), (2017, 4, 31), (2017, 4, 0), (9999, 1, 1)]
+        for (year, month, day) in
+            [(1969, 12, 31), (2100, 2, 29), (2017, 13, 1), (2017, 4, 31), (2017, 4, 0), (9999, 1, 1)]
         {
             assert_eq!(days(year, month, day), None, "{year}-{month}-{day}");
         }

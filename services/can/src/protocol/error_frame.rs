@@ -259,7 +259,10 @@ mod tests {
                 "receive buffer overflow; transmit buffer overflow; error warning by receive errors; error warning by transmit errors; error passive by receive errors; error passive by transmit errors; error active again",
             ),
             ("20000200#000000000000A1B2", "TEC 161, REC 178"),
-            ("20000028#0000001B00000000", "protocol violation; in the acknowledge delimiter; no acknowledgement"),
+            (
+                "20000028#0000001B00000000",
+                "protocol violation; in the acknowledge delimiter; no acknowledgement",
+            ),
             ("20000000#0000000000000000", "error without a reason"),
             ("20001000#0000000000000000", "unknown class 1000h"),
         ];

@@ -199,6 +199,9 @@ pub enum Action {
     ReplyAndClose(&'static [u8]),
     /// Put the frame on the bus; there is no answer.
     Transmit(Frame),
+    /// A frame that cannot be sent, in raw mode: there is no answer, as with the original. python-can takes one for a
+    /// frame and never reads anything again.
+    Refused,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -229,6 +232,7 @@ impl Session {
     /// Answers one command; `bus` is the one bus this server has.
     pub fn handle(&mut self, command: &Command, bus: &str) -> Action {
         match *command {
+            Command::Nonsense(BAD_SEND | BAD_RTR) if self.mode == Mode::Raw => Action::Refused,
             Command::Nonsense(why) => Action::Reply(why),
             Command::Echo => Action::Reply(ECHO),
             Command::Open(name) if self.mode == Mode::NoBus => {

@@ -27,7 +27,9 @@ pub struct Filter {
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum FilterError {
     /// Not hex digits, or too many.
-    #[error("filter '{0}' must be 3 hex digits (11 bits) or 8 (29 bits), with a mask as \"1A0:7F0\" or \"18FEF100:1FFFFF00\"")]
+    #[error(
+        "filter '{0}' must be 3 hex digits (11 bits) or 8 (29 bits), with a mask as \"1A0:7F0\" or \"18FEF100:1FFFFF00\""
+    )]
     Text(String),
     /// A bit of the identifier is under no bit of the mask.
     #[error("filter '{text}' never matches: identifier bits {bits:X} are not in the mask")]
@@ -118,7 +120,9 @@ impl<'de> Deserialize<'de> for Filters {
         impl<'de> de::Visitor<'de> for Visit {
             type Value = Filters;
             fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-                f.write_str("\"none\", \"auto\", or a list such as [\"1A0\", \"280:780\", \"18FEF100:1FFFFF00\"]")
+                f.write_str(
+                    "\"none\", \"auto\", or a list such as [\"1A0\", \"280:780\", \"18FEF100:1FFFFF00\"]",
+                )
             }
             fn visit_str<E: de::Error>(self, text: &str) -> Result<Filters, E> {
                 match text {
@@ -152,7 +156,10 @@ pub fn derived(stack: &Stack, bus: &str) -> Result<Vec<Filter>, String> {
         }
     }
     if all.len() > MAX_FILTERS {
-        return Err(format!("the readers take {} identifiers, the kernel filters at most {MAX_FILTERS}", all.len()));
+        return Err(format!(
+            "the readers take {} identifiers, the kernel filters at most {MAX_FILTERS}",
+            all.len()
+        ));
     }
     if all.is_empty() {
         return Err("no reader names an identifier".to_owned());
@@ -247,11 +254,13 @@ mod tests {
     #[test]
     fn derived_from_the_stack() {
         let io = |ids: &[(u32, bool)]| {
-            let of = |&(value, extended): &(u32, bool)| json!({ "id": { "value": value, "extended": extended } });
+            let of =
+                |&(value, extended): &(u32, bool)| json!({ "id": { "value": value, "extended": extended } });
             json!({ "in": ids.iter().map(of).collect::<Vec<_>>() })
         };
         let list = |readers: &[_]| {
-            derived(&stack(readers), "can0").map(|all| all.iter().map(Filter::to_string).collect::<Vec<_>>().join(" "))
+            derived(&stack(readers), "can0")
+                .map(|all| all.iter().map(Filter::to_string).collect::<Vec<_>>().join(" "))
         };
         let two = [
             ("io", "can-io", io(&[(0x1A0, false), (0x2B0, false), (0x1A0, false)])),

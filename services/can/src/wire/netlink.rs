@@ -250,7 +250,10 @@ fn set(wanted: &Wanted, is: &Interface, timing: bool) -> Result<String, LinkErro
         let _ = link.set_restart_ms(0);
     }
     link.bring_up().map_err(system(name, "raising it"))?;
-    Ok(format!("interface {name}: did what `{}` does", command(&Wanted { restart_ms: 0, ..wanted.clone() }, is)))
+    Ok(format!(
+        "interface {name}: did what `{}` does",
+        command(&Wanted { restart_ms: 0, ..wanted.clone() }, is)
+    ))
 }
 
 /// Restarts the controller after bus-off. A line discipline has no restart (and kernels before 6.16 crash when asked for
@@ -320,7 +323,10 @@ mod tests {
             LinkError::NotCan("eth0".into()),
             LinkError::Down {
                 name: "can0".into(),
-                command: command(&wanted(), &Interface { settable: true, device: true, ..Interface::default() }),
+                command: command(
+                    &wanted(),
+                    &Interface { settable: true, device: true, ..Interface::default() },
+                ),
                 why: " as root, or give this process CAP_NET_ADMIN",
             },
             LinkError::System {

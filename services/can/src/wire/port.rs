@@ -215,6 +215,27 @@ mod tests {
         /dev/ttyACM0 is in use by another program: end it first (`fuser /dev/ttyACM0` names it)
         no permission for /dev/ttyACM0: it belongs to group 'dialout'; run `sudo usermod -aG dialout $USER`, then log in again
         ");
+    }
+
+    #[test]
+    fn the_group_that_owns_the_device_is_named() {
+        let path = std::env::temp_dir().join(format!("dinrail-group-{}", std::process::id()));
+        std::fs::write(&path, "").unwrap();
+        let groups = std::fs::read_to_string("/etc/group").unwrap();
+        let dialout =
+            groups.lines().find_map(|line| line.strip_prefix("dialout:x:")?.split(':').next()?.parse().ok());
+        // Only root may give a file away; else it is the group of this process.
+        let given = dialout.is_some_and(|gid| std::os::unix::fs::chown(&path, None, Some(gid)).is_ok());
+        let group = group_name(std::fs::metadata(&path).unwrap().gid()).unwrap();
+        assert!(!given || group == "dialout");
+        let said = permission(path.to_str().unwrap()).to_string();
+        let remedy = if group == "root" {
+            "it belongs to root alone: a udev rule must give it a group".to_owned()
+        } else {
+            format!("it belongs to group '{group}'; run `sudo usermod -aG {group} $USER`, then log in again")
+        };
+        assert_eq!(said, format!("no permission for {}: {remedy}", path.display()));
+        std::fs::remove_file(&path).unwrap();
         assert_eq!(group_name(0).as_deref(), Some("root"));
         assert_eq!(group_name(u32::MAX - 7), None);
     }

@@ -212,9 +212,10 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
         for _ in 0..TURN_BATCHES {
             let mut batch = self.batch.take().unwrap_or_default();
             let more = match sys::receive(self.socket.get_ref().as_fd(), &mut batch) {
-                Ok(_) => {
+                Ok(count) => {
                     self.taken(batch.items());
-                    true
+                    // What comes after this makes the socket readable again.
+                    count == sys::BATCH
                 }
                 Err(e) if e.kind() == io::ErrorKind::WouldBlock => false,
                 Err(e) if e.kind() == io::ErrorKind::Interrupted => true,

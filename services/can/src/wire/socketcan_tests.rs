@@ -124,8 +124,7 @@ fn an_adapter_without_a_word_of_acknowledgement() {
 #[test]
 fn what_the_kernel_dropped_is_counted() {
     with_wire(&settings(100, &[]), |wire, _, _| {
-        let received =
-            |drops| Received { frame: Frame::default(), own: false, utc_ns: None, drops };
+        let received = |drops| Received { frame: Frame::default(), own: false, utc_ns: None, drops };
         assert!(!wire.dropped(&received(None)));
         assert!(wire.dropped(&received(Some(7))));
         assert!(!wire.dropped(&received(Some(7))));
@@ -154,7 +153,10 @@ fn bus_off_is_met_by_a_restart_with_back_off() {
         wire.restart_at_ns = Some(0);
         wire.restart_if_due();
         let said = ears.said.borrow().join("\n");
-        assert!(said.contains("it stays in bus-off: `ip link set nocan42 type can restart` as root"), "{said}");
+        assert!(
+            said.contains("it stays in bus-off: `ip link set nocan42 type can restart` as root"),
+            "{said}"
+        );
         assert_eq!(wire.restarts, 3);
     });
     with_wire(&settings(0, &[]), |wire, _, ears| {
@@ -179,9 +181,7 @@ fn own_frames_outside_of_the_filters_need_no_echo() {
         }
         assert!(matches!(wire.exchange(), End::No));
         let mut bytes = [0; 80];
-        let sent: Vec<_> = std::iter::from_fn(|| far.recv(&mut bytes).ok())
-            .map(|n| n)
-            .collect();
+        let sent: Vec<_> = std::iter::from_fn(|| far.recv(&mut bytes).ok()).map(|n| n).collect();
         assert_eq!(sent, [16, 16, 16]);
         let seen: Vec<_> = ears.frames.borrow().iter().map(|(text, _)| text.clone()).collect();
         assert_eq!(seen, ["210#01", "211#03"], "123 waits for its echo");

@@ -49,8 +49,8 @@ impl Default for Config {
 /// Ready devices.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Simulation {
-    /// CiA 401: 16 digital inputs and outputs, 4 analogue inputs and outputs. Inputs show the outputs, inverted, so
-    /// that a master sees an effect.
+    /// CiA 401: 16 digital inputs and outputs, 4 analogue inputs and outputs. Inputs show the outputs, so that a
+    /// master sees an effect.
     #[serde(rename = "401")]
     Cia401,
 }

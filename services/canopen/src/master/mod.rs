@@ -1,7 +1,6 @@
 //! The role of the master: what it does on top of the protocol, sans-I/O.
 
 pub mod boot;
-pub mod device;
 pub mod exchange;
 pub mod network;
 pub mod plan;

@@ -1,6 +1,6 @@
 //! A small device for tests of the master: an object dictionary behind an SDO server, NMT, a heartbeat.
 
-use crate::master::device::{Device, Named};
+use crate::device::{Device, Named};
 use crate::protocol::data_type::DataType;
 use crate::protocol::io::Outbox;
 use crate::protocol::nmt::{NmtCommand, NmtState, boot_up_frame, heartbeat_frame};

@@ -4,6 +4,7 @@
 pub mod abort;
 pub mod cob_id;
 pub mod data_type;
+pub mod eds;
 pub mod emcy;
 pub mod error_control;
 pub mod io;

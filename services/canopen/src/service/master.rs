@@ -7,7 +7,7 @@ use super::{
     no_only_bus, plc_of, words,
 };
 use crate::config::{MasterConfig as Config, Number, ObjectRef, OnStop, OnStopWord};
-use crate::master::device::Device;
+use crate::device::Device;
 use crate::master::exchange::Exchange;
 use crate::master::network::{Event, Network, NodeRun, state_name};
 use crate::master::plan::{Plan, encode, plan};

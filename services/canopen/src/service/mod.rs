@@ -4,6 +4,7 @@ mod jobs;
 pub mod load;
 pub mod master;
 mod outputs;
+pub mod slave;
 mod words;
 
 use dinrail_iec::Addressing;

@@ -79,7 +79,18 @@ fn what_cannot_be_asked_is_named() {
     .iter()
     .map(|job| Ask::from_json(job).unwrap_err().to_string())
     .collect();
-    insta::assert_snapshot!(all.join("\n"), @"");
+    insta::assert_snapshot!(all.join("\n"), @r#"
+    the job lacks "do" (a text)
+    a modbus-client does not know the job 'fly'; it knows read, write, mask, read_write, exception_status, diagnostics, event_counter, event_log, server_id, read_file, write_file, read_fifo, identification, raw, status
+    the job lacks "table" (coils, discrete_inputs, input_registers or holding_registers)
+    "at": 70000 is not 0 to 65535
+    "count": 126 is not 1 to 125
+    input_registers cannot be written; coils and holding_registers can
+    "values": 65536 is not -32768 to 65535
+    the job lacks "values" (a list of true and false)
+    "values": 0 is not 1 to 123
+    "pdu": '0' is no list of 1 to 253 hexadecimal bytes
+    "#);
 }
 
 proptest! {

@@ -218,9 +218,9 @@ impl WriteTable {
         }
     }
 
-    /// The image is stale or the program does not run. `stop` gets the ranges whose waiting writes are to be
-    /// forgotten, `write` those with safe values.
-    pub fn safe(&mut self, mut stop: impl FnMut(usize), mut write: impl FnMut(usize, &[u8])) {
+    /// The image is stale or the program does not run. `act` gets every range: its waiting writes are to be forgotten,
+    /// and this request, if there is one, is to be written.
+    pub fn safe(&mut self, mut act: impl FnMut(usize, Option<&[u8]>)) {
         if !self.running {
             return;
         }
@@ -229,12 +229,9 @@ impl WriteTable {
             output.due_ns = None;
             // The first image afterwards is written, whatever it holds.
             output.handed = None;
-            stop(i);
-            if let Some(safe) = &output.range.safe {
-                let mut pdu = [0; MAX_PDU];
-                let len = request(&output.range, safe, &mut pdu);
-                write(i, &pdu[..len]);
-            }
+            let mut pdu = [0; MAX_PDU];
+            let len = output.range.safe.as_ref().map(|safe| request(&output.range, safe, &mut pdu));
+            act(i, len.map(|len| &pdu[..len]));
         }
     }
 }

@@ -120,7 +120,7 @@ fn a_broadcast_has_no_answer_but_a_pause() {
     line.answer(0, &[6, 0, 0, 0, 1], 6 * MS);
     assert_eq!(steps(&mut line, 6 * MS), ["wait 205"]);
     assert_eq!(steps(&mut line, 205 * MS)[..2], ["done Job(1) []", "send 1 [03, 00, 00, 00, 01]"]);
-    assert_eq!(line.counters().late, 1);
+    assert_eq!(line.units().next().unwrap().counters.discarded, 1);
     // On a connection unit 0 is a unit.
     let mut line = Line::new(TCP, unit(100, 1));
     line.push_job(1, 0, &[6, 0, 0, 0, 1], u64::MAX, false).unwrap();
@@ -372,7 +372,8 @@ proptest! {
         let write = line.add_slot(3, SlotKind::Write, &[], None);
         let mut asked = BTreeMap::new();
         let mut ended = BTreeMap::new();
-        let (mut now_ns, mut next, mut in_flight): (u64, usize, Option<Origin>) = (0, 0, None);
+        // Until when the request in flight may be answered.
+        let (mut now_ns, mut next, mut in_flight): (u64, usize, Option<u64>) = (0, 0, None);
         // Frames on their way: (time, unit, pdu).
         let mut coming: Vec<(u64, u8, Vec<u8>)> = Vec::new();
         let (mut pushed, mut rounds) = (0u64, 0u32);
@@ -390,10 +391,13 @@ proptest! {
             let until = loop {
                 match line.step(now_ns) {
                     Step::Wait(until) => break until,
-                    Step::Reset => coming.clear(),
+                    Step::Reset => {
+                        coming.clear();
+                        in_flight = None;
+                    }
                     Step::Send { unit, pdu, origin } => {
-                        prop_assert!(in_flight.is_none_or(|o| o == origin), "two in flight");
-                        in_flight = Some(origin);
+                        prop_assert!(in_flight.is_none_or(|until_ns| now_ns >= until_ns), "two in flight: {origin:?}");
+                        in_flight = Some(u64::MAX);
                         sending = Some((unit, pdu.to_vec()));
                         break Some(now_ns);
                     }
@@ -424,6 +428,7 @@ proptest! {
                     line.answer(unit, &pdu, now_ns);
                 }
                 line.sent(now_ns);
+                in_flight = Some(now_ns + 100 * MS);
                 let right = answer_to(&pdu);
                 match fate {
                     Fate::Answer => coming.push((now_ns + 5 * MS, unit, right)),

@@ -132,7 +132,43 @@ fn mistakes_are_named() {
         write(json!({ "safe_values": [70000] })),
         write(json!({ "table": "coils", "from": "%QX0.0", "safe_values": [0.5] })),
     ];
-    insta::assert_snapshot!(all.join("\n"), @"");
+    insta::assert_snapshot!(all.join("\n"), @r#"
+    : the service has no line: neither serial nor tcp -> add serial = "NAME", or tcp = "ADDRESS:502"
+    tcp: the service has a serial line and a connection -> remove serial or tcp
+    mode: mode "tcp" is for connections -> use "rtu" or "ascii" on a serial line
+    mode: mode "ascii" is for serial lines -> use "tcp", or "rtu" for a converter that passes RTU frames on
+    max_batch: max_batch = 126 is not 1 to 125 -> 125 is the default
+    response_timeout: response_timeout = 10us is too short -> use at least 1ms; 1s is the default
+    probe_max: probe_max is shorter than probe_min -> exchange them, or leave them out
+    unit[1].id: unit 1 stands twice on its line -> one [[service.unit]] a unit and line
+    unit[1]: unit 2 has no line -> give it tcp = "ADDRESS:502", or give the service a line
+    read[0].unit: no [[service.unit]] has the id 5, and the service has no line of its own -> add a [[service.unit]], or correct the unit
+    read[1].unit: 2 units have the id 1; call the one you mean by its name -> add a [[service.unit]], or correct the unit
+    read[2].unit: no unit has the name 'x'; there are: a -> add a [[service.unit]], or correct the unit
+    read[0].unit: unit 0 is the broadcast: nobody answers -> read from units 1 to 247
+    read[0].to: %QW0 is no input: what is read goes to %I -> write %I...
+    read[0].to: %IX0.0 does not hold holding_registers -> use B, W, D or L addresses for registers
+    read[0].to: %IW0 does not hold coils -> use X or B addresses for bits
+    read[0].count: 126 holding_registers in one range: 1 to 125 are possible -> split the range
+    read[0].count: 0 holding_registers in one range: 1 to 125 are possible -> split the range
+    read[0].at: the range ends behind address 65535 -> lower at or count
+    read[0].count: count 3 splits a value of 2 registers -> D needs a multiple of 2, L of 4
+    read[0].order: order CDAB is not possible here -> AB and BA are for single registers, ABCD, DCBA, BADC, CDAB for %xD and %xL; bits have none
+    read[0].order: order AB is not possible here -> AB and BA are for single registers, ABCD, DCBA, BADC, CDAB for %xD and %xL; bits have none
+    read[0].symbol: a symbol names one value, and this range has several -> give the symbol to a range of one value, or declare a VAR AT in the program
+    read[0].type: %IW0 has 16 bits, REAL has 32 -> use X for BOOL, B, W, D, L for 8, 16, 32, 64 bits
+    read[0].status_to: '%IW4' is no byte of the inputs -> write %IB and a number, as %IB10
+    read[0].to: several bits begin in the middle of a byte -> begin at bit 0, or read them one by one
+    read[0].to: %IB65535 and 2 bytes reach beyond 65536 bytes -> lower the address or count
+    read[1].to: lies over read[0].to -> give every bit of %I to one read only
+    write[0].table: input_registers cannot be written -> use "coils" or "holding_registers"
+    write[0].from: %IW0 is no output: what is written comes from %Q or %M -> write %Q... or %M...
+    write[0]: it is written neither on change nor by period -> add period = "1s"
+    write[0].period: a period below 1ms is none -> use at least 1ms
+    write[0].safe_values: 0 values for 1 -> give one number a value of the range, in its type
+    write[0].safe_values: 70000 is no whole number of 16 bits -> give one number a value of the range, in its type
+    write[0].safe_values: 0.5 is no bit -> give one number a value of the range, in its type
+    "#);
 }
 
 #[test]

@@ -557,16 +557,12 @@ impl Service {
             Some(why) => {
                 let was_running = self.writes.is_running();
                 let Self { writes, runners, write_slots, .. } = self;
-                let mut stopped = Vec::new();
-                writes.safe(|i| stopped.push(i), |i, pdu| {
-                    // First what waits is forgotten, then the safe value waits.
-                    stopped.retain(|&s| s != i);
+                writes.safe(|i, pdu| {
                     drop_write(runners, write_slots, i);
-                    set_write(runners, write_slots, i, pdu, now_ns);
+                    if let Some(pdu) = pdu {
+                        set_write(runners, write_slots, i, pdu, now_ns);
+                    }
                 });
-                for i in stopped {
-                    drop_write(&mut self.runners, &self.write_slots, i);
-                }
                 if was_running {
                     self.safe_told = true;
                     let message = format!("writes went to their safe state: {}", why.text());

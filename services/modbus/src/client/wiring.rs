@@ -121,15 +121,14 @@ pub(crate) fn check_serial(me: &str, key: &str, service: &str, ascii: bool, stac
         };
         return vec![Finding::error(me, key, format!("there is no serial service '{service}'"), help)];
     };
-    let framing = entry.config.get("framing").and_then(|f| f.as_str());
+    let framing = entry.config.get("framing").and_then(|f| f.as_str()).unwrap_or("rtu");
     let wanted = if ascii { "ascii" } else { "rtu" };
-    match framing {
-        Some(framing) if framing != wanted => {
-            let message = format!("serial service '{service}' has framing \"{framing}\"");
-            vec![Finding::error(me, key, message, format!("set framing = \"{wanted}\" there, or change mode here"))]
-        }
-        _ => Vec::new(),
+    if framing == wanted {
+        return Vec::new();
     }
+    let message = format!("serial service '{service}' has framing \"{framing}\"");
+    let help = format!("set framing = \"{wanted}\" there, or change mode here");
+    vec![Finding::error(me, key, message, help)]
 }
 
 /// Every mistake that can be found without starting.

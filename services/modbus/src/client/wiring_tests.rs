@@ -86,5 +86,12 @@ fn findings() {
         said(demo(), vec![serial("rtu")]),
         said(short, vec![serial("rtu"), plc()]),
     ];
-    insta::assert_snapshot!(all.join("\n"), @"");
+    insta::assert_snapshot!(all.join("\n"), @r#"
+    : the service has neither read nor write -> add [[service.read]] or [[service.write]]; jobs of others are carried out in any case
+    serial: there is no serial service 'com1' -> add a [[service]] with kind = "serial"
+    serial: there is no serial service 'com1' -> set it to one of: com2
+    serial: serial service 'com1' has framing "ascii" -> set framing = "rtu" there, or change mode here
+    plc: the stack has no plc service -> add a [[service]] with kind = "plc"; it works without a program too
+    stale_after: stale_after = 10ms is shorter than 3 times the longest time between two scans of 'plc' -> leave it out (200ms) or set at least "30ms"
+    "#);
 }

@@ -7,4 +7,9 @@
 //! on a line, an exception 04 of the gateway's own, a master that keeps others from the line.
 
 pub mod cache;
+pub mod config;
 pub mod core;
+mod service;
+
+pub use config::Config;
+pub use service::{KIND, RunError, check, run, topics};

@@ -198,7 +198,7 @@ mod tests {
             let mut out = [0; MAX_ADU];
             let len = encode(unit, &pdu, &mut out);
             prop_assert_eq!(decode(&out[..len]), Ok((unit, &pdu[..])));
-            out[usize::from(at) % len] ^= 1 << bit;
+            out[usize::from(at) % len] ^= 1_u8 << bit;
             prop_assert!(decode(&out[..len]).is_err());
         }
     }

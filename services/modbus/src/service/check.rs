@@ -150,7 +150,10 @@ fn check_lines(service: &str, config: &Config, stack: &Stack, findings: &mut Vec
             let help = "leave it out (1s)";
             findings.push(Finding::error(service, &key("answer_within"), "no answer could be in time", help));
         }
-        let framing = stack.service(&line.port).and_then(|port| port.config.get("framing")?.as_str());
+        // "rtu" is what a serial service has without the key.
+        let framing = stack.service(&line.port).filter(|port| port.kind == "serial").map(|port| {
+            port.config.get("framing").and_then(|framing| framing.as_str()).unwrap_or("rtu")
+        });
         let wanted = match line.mode {
             Mode::Rtu => "rtu",
             Mode::Ascii => "ascii",

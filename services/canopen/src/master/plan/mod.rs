@@ -9,12 +9,14 @@ pub use pdo::{Direction, Mapped, Pdo};
 pub use value::encode;
 
 use super::boot::{self, ErrorControl, Identity, Write};
-use super::device::Device;
 use super::exchange::{self, Field, RxPdo, TxPdo, transmission};
 use super::network::{NodeSettings, Settings};
 use crate::config::{
     Check, MAX_MAPS, MAX_NODES, MAX_SDO_WRITES, Map, MasterConfig as Config, Node, OnBadWord, Restore,
 };
+use crate::device::Device;
+use crate::mistakes::{Mistake, Mistakes};
+use crate::place::{self, iec_type};
 use crate::protocol::cob_id::CobId;
 use crate::protocol::data_type::{DataType, unsigned};
 use dinrail_iec::artifact::AreaKind;
@@ -27,41 +29,6 @@ use std::collections::BTreeMap;
 const CONSUMER_FACTOR: u64 = 3;
 /// A restart of the master takes about this long: a consumer in a node that waits less sees the master die.
 const RESTART_MS: u64 = 500;
-
-/// Something wrong in the service's table.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Mistake {
-    /// Path of the key: `node[2].map[0].to`.
-    pub key: String,
-    pub message: String,
-    /// What to do about it.
-    pub help: String,
-    /// The stack runs all the same.
-    pub warning: bool,
-}
-
-/// Mistakes so far.
-#[derive(Debug, Default)]
-pub struct Mistakes(pub Vec<Mistake>);
-
-impl Mistakes {
-    fn add(&mut self, key: &str, message: impl Into<String>, help: impl Into<String>) {
-        self.0.push(Mistake {
-            key: key.to_owned(),
-            message: message.into(),
-            help: help.into(),
-            warning: false,
-        });
-    }
-    fn warn(&mut self, key: &str, message: impl Into<String>, help: impl Into<String>) {
-        self.0.push(Mistake {
-            key: key.to_owned(),
-            message: message.into(),
-            help: help.into(),
-            warning: true,
-        });
-    }
-}
 
 /// Everything about one node.
 #[derive(Debug, Clone)]
@@ -464,13 +431,11 @@ impl One<'_> {
         }
         let number = planner.place(direction, object, &format!("{key}.object"), self.mistakes)?;
         let entry = device.od.find(object.0, object.1).ok().and_then(|e| device.od.entry(e))?;
-        let bits = u32::from(entry.pdo_bits().unwrap_or(0));
-        if bits > at.size.bits() {
-            let message =
-                format!("{:04X}:{:02X} has {bits} bits, {text} has {}", object.0, object.1, at.size.bits());
+        if let Err(message) = place::fits(entry, at, text) {
             self.mistakes.add(&end, message, "take a larger place: B has 8 bits, W 16, D 32, L 64");
             return None;
         }
+        let bits = u32::from(entry.pdo_bits().unwrap_or(0));
         let status =
             map.status_to.as_ref().and_then(|text| self.status_byte(text, &format!("{key}.status_to")));
         Some(Placed {
@@ -629,34 +594,6 @@ struct Placed {
     on_bad: OnBad,
     status: Option<u32>,
     key: String,
-}
-
-/// IEC type of an object at a place of this size.
-fn iec_type(data_type: DataType, at: LocatedAddress) -> &'static str {
-    let bits = at.size.bits();
-    match (data_type, bits) {
-        (_, 1) => "BOOL",
-        (DataType::Real32, 32) => "REAL",
-        (DataType::Real64, 64) => "LREAL",
-        _ if data_type.is_signed() => match bits {
-            8 => "SINT",
-            16 => "INT",
-            32 => "DINT",
-            _ => "LINT",
-        },
-        _ if data_type.is_unsigned() => match bits {
-            8 => "USINT",
-            16 => "UINT",
-            32 => "UDINT",
-            _ => "ULINT",
-        },
-        _ => match bits {
-            8 => "BYTE",
-            16 => "WORD",
-            32 => "DWORD",
-            _ => "LWORD",
-        },
-    }
 }
 
 #[cfg(test)]

@@ -4,10 +4,10 @@
 //! configured for it. Sans-I/O; source of layouts: CiA 301 V4.2, clauses 7.5.2.35 to 7.5.2.38.
 
 use super::super::boot::Write;
-use super::super::device::Device;
 use super::super::exchange::transmission;
-use super::Mistakes;
 use crate::config::{Node, Pdo as Wanted};
+use crate::device::Device;
+use crate::mistakes::Mistakes;
 use crate::protocol::cob_id::{BIT_31, CobId, is_restricted};
 use crate::protocol::data_type::unsigned;
 use std::collections::BTreeSet;

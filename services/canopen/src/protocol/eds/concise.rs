@@ -127,7 +127,8 @@ mod tests {
         fn round_trip(list in prop::collection::vec((any::<u16>(), any::<u8>(), any::<Vec<u8>>()), 0..20)) {
             let items: Vec<_> =
                 list.iter().map(|(index, sub, data)| Item { index: *index, sub: *sub, data }).collect();
-            prop_assert_eq!(decode(&encode(items.iter().copied())), Ok(items));
+            let bytes = encode(items.iter().copied());
+            prop_assert_eq!(decode(&bytes), Ok(items));
         }
         #[test]
         fn any_bytes(mut bytes: Vec<u8>) {

@@ -47,9 +47,17 @@ pub struct Ini {
     by_name: HashMap<String, usize>,
 }
 
-/// The name as it is compared: small letters, no blanks.
-fn fold(name: &str) -> String {
-    name.chars().filter(|c| !c.is_whitespace()).map(|c| c.to_ascii_lowercase()).collect()
+/// The name as it is compared: small letters, no blanks, no `0x` in front, no zeros in front of a sub-index.
+pub(super) fn fold(name: &str) -> String {
+    let name: String = name.chars().filter(|c| !c.is_whitespace()).map(|c| c.to_ascii_lowercase()).collect();
+    let name = name.strip_prefix("0x").unwrap_or(&name);
+    match name.split_once("sub") {
+        Some((index, sub)) if index.len() == 4 && sub.len() > 1 && sub.is_ascii() => {
+            let zeros = sub[..sub.len() - 1].bytes().take_while(|&byte| byte == b'0').count();
+            format!("{index}sub{}", &sub[zeros..])
+        }
+        _ => name.to_owned(),
+    }
 }
 
 impl Ini {
@@ -66,11 +74,10 @@ impl Ini {
         let after = after.and_then(|after| self.by_name.get(&fold(after)).copied());
         let at = after.map_or(self.sections.len(), |at| at + 1);
         self.sections.insert(at, section);
-        self.index();
+        for (at, section) in self.sections.iter().enumerate().skip(at) {
+            self.by_name.insert(fold(&section.name), at);
+        }
         &mut self.sections[at]
-    }
-    fn index(&mut self) {
-        self.by_name = self.sections.iter().enumerate().map(|(at, s)| (fold(&s.name), at)).collect();
     }
 
     /// Reads the text of a file.
@@ -96,11 +103,21 @@ impl Ini {
                 continue;
             }
             let Some((key, value)) = line.split_once('=') else {
-                diags.push(Diag::warning(number, "", "", format!("'{}' is no key=value: ignored", short(line))));
+                diags.push(Diag::warning(
+                    number,
+                    "",
+                    "",
+                    format!("'{}' is no key=value: ignored", short(line)),
+                ));
                 continue;
             };
             let Some(section) = current.and_then(|at| ini.sections.get_mut(at)) else {
-                diags.push(Diag::warning(number, "", key.trim(), "before the first [section]: ignored".to_owned()));
+                diags.push(Diag::warning(
+                    number,
+                    "",
+                    key.trim(),
+                    "before the first [section]: ignored".to_owned(),
+                ));
                 continue;
             };
             add(section, key.trim(), value.trim(), number, diags);
@@ -150,7 +167,11 @@ fn add(section: &mut Section, key: &str, value: &str, line: u32, diags: &mut Vec
 
 /// The beginning of a text, for messages.
 pub(super) fn short(text: &str) -> String {
-    if text.chars().count() <= 40 { text.to_owned() } else { text.chars().take(37).collect::<String>() + "..." }
+    if text.chars().count() <= 40 {
+        text.to_owned()
+    } else {
+        text.chars().take(37).collect::<String>() + "..."
+    }
 }
 
 /// The text of a file: UTF-8, UTF-16 with a byte order mark, or else Latin-1, which every byte is.

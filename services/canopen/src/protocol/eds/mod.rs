@@ -221,7 +221,11 @@ impl Eds {
     pub fn name(&self, index: u16, sub: u8) -> Option<String> {
         let object = self.objects.get(&index)?;
         let entry = object.subs.get(&sub)?;
-        Some(if object.code.has_subs() { format!("{}, {}", object.name, entry.name) } else { object.name.clone() })
+        Some(if object.code.has_subs() {
+            format!("{}, {}", object.name, entry.name)
+        } else {
+            object.name.clone()
+        })
     }
     /// Index, sub-index and name of every sub-object, ascending.
     pub fn names(&self) -> impl Iterator<Item = (u16, u8, String)> + '_ {

@@ -70,7 +70,9 @@ pub(super) fn parse(text: &str, data_type: DataType) -> Parsed<Option<Value>> {
     let plain = |bytes| Some(Value { bytes, node_relative: false });
     match data_type {
         DataType::VisibleString => Ok((plain(text.as_bytes().to_vec()), None)),
-        DataType::UnicodeString => Ok((plain(text.encode_utf16().flat_map(u16::to_le_bytes).collect()), None)),
+        DataType::UnicodeString => {
+            Ok((plain(text.encode_utf16().flat_map(u16::to_le_bytes).collect()), None))
+        }
         DataType::TimeOfDay | DataType::TimeDifference => {
             let (value, remark) = unsigned(text)?;
             if value >> 48 != 0 {
@@ -124,7 +126,8 @@ fn fit(number: i128, text: &str, data_type: DataType) -> Result<Vec<u8>, String>
         return Ok(bytes);
     }
     let bits = u32::from(data_type.bits().unwrap_or(0));
-    if data_type.is_signed() && number >= 0 && number < 1 << bits && text.to_ascii_lowercase().contains("0x") {
+    if data_type.is_signed() && number >= 0 && number < 1 << bits && text.to_ascii_lowercase().contains("0x")
+    {
         return Ok(number.to_le_bytes()[..(bits / 8) as usize].to_vec());
     }
     Err(format!("'{}' does not fit a {data_type}", super::ini::short(text)))
@@ -150,7 +153,9 @@ fn formula(text: &str) -> Result<(i128, bool, Option<String>), String> {
             remark = remark.or(note);
         }
     }
-    if (!before.is_empty() && !before.ends_with('+')) || (!behind.is_empty() && !behind.starts_with(['+', ';'])) {
+    if (!before.is_empty() && !before.ends_with('+'))
+        || (!behind.is_empty() && !behind.starts_with(['+', ';']))
+    {
         return Err(bad());
     }
     Ok((sum, true, remark))

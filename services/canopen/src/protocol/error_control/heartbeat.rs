@@ -18,13 +18,14 @@ pub struct HeartbeatProducer {
 }
 
 impl HeartbeatProducer {
-    /// Takes a new period; the first heartbeat is due one period later. The same period again changes nothing.
+    /// Takes what was written; the first heartbeat is due at once (7.2.8.3.2.2: the protocol begins immediately).
     pub fn configure(&mut self, t_ns: u64, period_ms: u16) {
-        let period_ns = u64::from(period_ms) * MS;
-        if period_ns != self.period_ns {
-            self.period_ns = period_ns;
-            self.next_ns = (period_ns > 0).then(|| t_ns.saturating_add(period_ns));
-        }
+        self.period_ns = u64::from(period_ms) * MS;
+        self.next_ns = self.is_on().then_some(t_ns);
+    }
+    /// The boot-up message goes out now and stands for the first heartbeat (7.2.8.3.2.2).
+    pub fn boot_up(&mut self, t_ns: u64) {
+        self.next_ns = self.is_on().then(|| t_ns.saturating_add(self.period_ns));
     }
     pub fn is_on(&self) -> bool {
         self.period_ns > 0
@@ -33,7 +34,7 @@ impl HeartbeatProducer {
     pub fn stop(&mut self) {
         *self = Self::default();
     }
-    /// The boot-up message went out or the state changed: a running producer tells at once and starts a new period,
+    /// The state changed: a running producer tells at once and starts a new period,
     /// so that consumers learn of the change without waiting for it.
     pub fn state_changed(&mut self, t_ns: u64, node_id: u8, state: NmtState, out: &mut Outbox) {
         if self.is_on() {
@@ -201,6 +202,8 @@ mod tests {
         let mut out = Outbox::default();
         let mut producer = HeartbeatProducer::default();
         producer.configure(0, 100);
+        assert_eq!(producer.next_deadline(), Some(0));
+        producer.boot_up(0);
         assert_eq!(producer.next_deadline(), Some(100 * MS));
         producer.on_time(101 * MS, 4, NmtState::PreOperational, &mut out);
         assert_eq!(producer.next_deadline(), Some(200 * MS), "lateness does not add up");

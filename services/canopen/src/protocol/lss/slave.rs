@@ -69,6 +69,10 @@ impl LssSlave {
             fastscan_at: 0,
         }
     }
+    /// The identity object changed: the application knows the serial number.
+    pub fn set_address(&mut self, address: LssAddress) {
+        self.address = address;
+    }
     pub fn state(&self) -> LssState {
         self.state
     }

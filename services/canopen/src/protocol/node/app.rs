@@ -62,7 +62,8 @@ impl Node {
         let Some((index, sub)) = self.od.entry(entry).map(|entry| (entry.index, entry.sub)) else {
             return Ok(());
         };
-        if (0x1000..=0x1FFF).contains(&index) && self.state() != NmtState::Initialising {
+        let communication = (0x1000..=0x1FFF).contains(&index);
+        if communication && (self.state() != NmtState::Initialising || index == super::object::IDENTITY) {
             self.apply(t_ns, index, sub, out);
             self.flush(t_ns, out);
         }
@@ -115,6 +116,13 @@ impl Node {
         let message =
             self.com.emcy.report(emcy::code::BUS_OFF_RECOVERED, emcy::register::COMMUNICATION, [0; 5]);
         self.com.events.push(NodeEvent::EmcyRaised(message));
+        self.flush(t_ns, out);
+    }
+    /// The device itself failed, e.g. its outputs cannot be served: the error behaviour of 1029h sub 2 (output error in
+    /// CiA 401), or of sub 1 where the device has no other. The EMCY is raised apart.
+    pub fn device_failed(&mut self, t_ns: u64, out: &mut Outbox) {
+        let sub = if self.od.find(super::object::ERROR_BEHAVIOUR, 2).is_ok() { 2 } else { 1 };
+        self.error_behaviour(t_ns, sub, out);
         self.flush(t_ns, out);
     }
     /// The stored image could not be kept: EMCY 6300h until it could.

@@ -36,7 +36,7 @@ use super::time_stamp::TimeStamp;
 use objects::object::*;
 
 /// How a node behaves, besides its objects.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Copy)]
 pub struct NodeParams {
     /// 1-127, or FFh: without node-id; then only LSS is served until a master gives one.
     pub node_id: u8,
@@ -80,13 +80,7 @@ impl Node {
             od.set_node_id(params.node_id);
             reset_objects(&mut od, 0x1000, 0xFFFF);
         }
-        let identity = |sub: u8| od.u32(IDENTITY, sub).unwrap_or(0);
-        let address = LssAddress {
-            vendor: identity(1),
-            product: identity(2),
-            revision: identity(3),
-            serial: identity(4),
-        };
+        let address = lss_address(&od);
         let history = od.entries_of(ERROR_FIELD).count().saturating_sub(1);
         let com = Com {
             node_id: params.node_id,
@@ -133,6 +127,7 @@ impl Node {
         self.servers.refresh_all(&self.od);
         com.events.push(NodeEvent::Reset { application });
         out.push(boot_up_frame(com.node_id));
+        com.heartbeat.boot_up(t_ns);
         let action = com.nmt.initialised();
         self.act(t_ns, action, out);
         if self_starts(self.od.u32(NMT_STARTUP, 0)) {
@@ -162,7 +157,6 @@ impl Node {
             com.sync.forget();
             com.clear(emcy::code::COMMUNICATION, 0);
         }
-        // The boot-up message stands for the first heartbeat.
         if from != NmtState::Initialising {
             com.heartbeat.state_changed(t_ns, com.node_id, to, out);
         }
@@ -172,7 +166,10 @@ impl Node {
     }
     /// The error behaviour of 1029h sub 1: communication errors.
     fn communication_error(&mut self, t_ns: u64, out: &mut Outbox) {
-        let value = self.od.u8(ERROR_BEHAVIOUR, 1).unwrap_or(0);
+        self.error_behaviour(t_ns, 1, out);
+    }
+    fn error_behaviour(&mut self, t_ns: u64, sub: u8, out: &mut Outbox) {
+        let value = self.od.u8(ERROR_BEHAVIOUR, sub).unwrap_or(0);
         let behaviour = ErrorBehaviour::from_object(value).unwrap_or_default();
         if let Some(to) = behaviour.target(self.com.nmt.state()) {
             let action = self.com.nmt.enter(to);
@@ -244,6 +241,11 @@ impl Node {
             0x1200..=0x127F => {
                 if let Some(channel) = SdoServers::channel_of(index) {
                     self.servers.refresh(&self.od, channel);
+                }
+            }
+            IDENTITY => {
+                if let Some(lss) = &mut self.com.lss {
+                    lss.set_address(lss_address(&self.od));
                 }
             }
             0x1400..=0x1BFF => self.com.configure_pdo(t_ns, &self.od, index, sub, out),
@@ -366,6 +368,10 @@ impl Node {
         }
         self.flush(t_ns, out);
     }
+}
+
+fn lss_address(od: &ObjectDictionary) -> LssAddress {
+    LssAddress::from_parts([1, 2, 3, 4].map(|sub| od.u32(IDENTITY, sub).unwrap_or(0)))
 }
 
 /// Gives the objects from `first` to `last` their defaults. Objects that the network cannot write keep their values:

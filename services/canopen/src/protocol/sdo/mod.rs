@@ -18,11 +18,11 @@ mod server;
 mod servers;
 #[cfg(test)]
 mod tests;
+mod transfer;
 
 pub use channel::{Channel, client_channel, restricted_can_id, server_channel, validate_parameter};
-pub use client::{
-    Busy, By, ClientConfig, ClientCounters, Direction, Failure, Finished, Mode, Options, SdoClient,
-};
+pub use client::SdoClient;
 pub use crc::crc16;
 pub use server::{SdoServer, ServerConfig, ServerCounters};
 pub use servers::SdoServers;
+pub use transfer::{Busy, By, ClientConfig, ClientCounters, Direction, Failure, Finished, Mode, Options};

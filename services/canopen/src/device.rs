@@ -1,7 +1,8 @@
 //! What is known of a node's device before it answers: its EDS or DCF.
 
 use crate::config::ObjectRef;
-use crate::protocol::od::ObjectDictionary;
+use crate::protocol::eds::{BuildOptions, Eds};
+use crate::protocol::od::{ObjectDictionary, OdError};
 
 /// An object that a name could mean.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -25,6 +26,16 @@ pub struct Device {
 }
 
 impl Device {
+    /// The device that an EDS or DCF describes, with this node-id (1-127).
+    pub fn from_eds(eds: &Eds, node_id: u8, options: &BuildOptions) -> Result<Self, OdError> {
+        Ok(Self {
+            name: eds.device.product_name.clone(),
+            od: eds.builder(options).build(node_id)?,
+            names: eds.names().map(|(index, sub, name)| Named { index, sub, name }).collect(),
+            values: eds.parameter_values(node_id),
+        })
+    }
+
     /// Name of an object, for output.
     pub fn name_of(&self, index: u16, sub: u8) -> Option<&str> {
         let at = self.names.binary_search_by_key(&(index, sub), |n| (n.index, n.sub)).ok()?;

@@ -1,0 +1,444 @@
+//! Where the commands of `dinrail modbus` go: a connection, a serial port, or a service of a running stack.
+
+use super::MasterArgs;
+use crate::commands::UsageError;
+use crate::supervise::client::{find, observe};
+use anyhow::Context as _;
+use dinrail_modbus::client::ask::{Ask, exception_words};
+use dinrail_modbus::protocol::client_fit::{Fit, Length, fit, length};
+use dinrail_modbus::protocol::mbap::{self, Scan};
+use dinrail_modbus::protocol::{ascii, rtu};
+use dinrail_serial::config::{Config as SerialConfig, Framing};
+use dinrail_serial::port::{Port, Read as PortRead};
+use ipc_types::clock;
+use ipc_types::payload::{Job, JobResult};
+use ipc_types::port::{Publisher, Subscriber};
+use ipc_types::topic::TopicKind;
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use serde_json::Value;
+use std::io::{Read, Write};
+use std::net::{TcpStream, ToSocketAddrs};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+/// How often the results of a service are looked at: tools have no inbox.
+const LOOK: Duration = Duration::from_millis(1);
+/// Longer than the service's own limits, which it reports better.
+const SERVICE_LIMIT: Duration = Duration::from_secs(20);
+
+/// Why there is no value.
+#[derive(Debug)]
+pub enum Failed {
+    /// The unit's or gateway's exception.
+    Exception(u8, String),
+    NoAnswer(String),
+    Other(String),
+}
+
+impl std::fmt::Display for Failed {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Exception(_, text) | Self::NoAnswer(text) | Self::Other(text) => f.write_str(text),
+        }
+    }
+}
+
+enum Wire {
+    Tcp { stream: TcpStream, transaction: u16 },
+    RtuOverTcp(TcpStream),
+    Serial { port: Port, ascii: bool, char_ns: u64, t35: Duration },
+    Service { name: String, writer: u32, jobs: Publisher<Job>, results: Subscriber<JobResult> },
+}
+
+/// A master with its unit.
+pub struct Master {
+    wire: Wire,
+    target: String,
+    unit: Value,
+    timeout: Duration,
+    retries: u8,
+}
+
+impl Master {
+    /// Opens the line; nothing is sent yet.
+    pub fn open(args: &MasterArgs) -> anyhow::Result<Self> {
+        let unit = match args.unit.parse::<u8>() {
+            Ok(number) => Value::from(number),
+            Err(_) => Value::from(args.unit.clone()),
+        };
+        let timeout = args.timeout.duration();
+        let wire = match args.target.split_once("://") {
+            Some(("tcp", address)) => Wire::Tcp { stream: connect(address, 502, timeout)?, transaction: 0 },
+            Some(("rtu-over-tcp", address)) => Wire::RtuOverTcp(connect(address, 502, timeout)?),
+            Some(("rtu", device)) => serial(device, false)?,
+            Some(("ascii", device)) => serial(device, true)?,
+            Some((scheme, _)) => {
+                return Err(UsageError(format!(
+                    "'{scheme}://' is none of tcp://, rtu://, ascii://, rtu-over-tcp://"
+                ))
+                .into());
+            }
+            None => service(&args.target, args.stack.as_deref())?,
+        };
+        if !matches!(wire, Wire::Service { .. }) && !unit.is_u64() {
+            return Err(UsageError(format!("unit '{}' is no number from 0 to 255", args.unit)).into());
+        }
+        Ok(Self { wire, target: args.target.clone(), unit, timeout, retries: args.retries })
+    }
+
+    /// One request, as [`Ask`] describes it.
+    pub fn ask(&mut self, job: &Value) -> anyhow::Result<Value> {
+        self.try_ask(job).map_err(|e| anyhow::anyhow!("{}: {e}", self.target))
+    }
+
+    /// The same with a cause that can be told apart.
+    pub fn try_ask(&mut self, job: &Value) -> Result<Value, Failed> {
+        let unit = self.unit.clone();
+        self.ask_unit(&unit, job)
+    }
+
+    /// The same to another unit.
+    pub fn ask_unit(&mut self, unit: &Value, job: &Value) -> Result<Value, Failed> {
+        let ask = Ask::from_json(job).map_err(|e| Failed::Other(e.to_string()))?;
+        if let Wire::Service { name, writer, jobs, results } = &mut self.wire {
+            let mut job = job.clone();
+            job["unit"] = unit.clone();
+            return through_service(name, *writer, jobs, results, &job);
+        }
+        let unit = unit.as_u64().unwrap_or(0) as u8;
+        let mut last = Failed::NoAnswer("no answer".to_owned());
+        for _ in 0..=self.retries {
+            match self.once(unit, ask.pdu()) {
+                Ok(pdu) => {
+                    return match fit(ask.pdu(), &pdu) {
+                        Fit::Exception(code) => {
+                            Err(Failed::Exception(code, exception_words(code, ask.pdu()[0])))
+                        }
+                        _ => ask.explain(&pdu).map_err(Failed::Other),
+                    };
+                }
+                Err(failed @ Failed::NoAnswer(_)) => last = failed,
+                Err(failed) => return Err(failed),
+            }
+        }
+        if let Failed::NoAnswer(text) = last {
+            return Err(Failed::NoAnswer(format!("unit {unit}: {text}. {}", self.why_silent())));
+        }
+        Err(last)
+    }
+
+    /// What to look at when nobody answers.
+    pub fn why_silent(&self) -> String {
+        match &self.wire {
+            Wire::Tcp { .. } => "The connection stands, so address and port are right; is the unit id? \
+                                 A gateway stays silent for units that it does not know."
+                .to_owned(),
+            Wire::RtuOverTcp(_) => "The connection stands; does the converter pass bytes on unchanged, and are its \
+                                    baud rate and parity those of the line?"
+                .to_owned(),
+            Wire::Serial { .. } => "Look at: unit id, A and B exchanged, baud rate and parity, RTU or ASCII, \
+                                    termination, the adapter's direction switching, another master on the line."
+                .to_owned(),
+            Wire::Service { name, .. } => format!("`dinrail status` shows what service '{name}' sees."),
+        }
+    }
+
+    fn once(&mut self, unit: u8, pdu: &[u8]) -> Result<Vec<u8>, Failed> {
+        let timeout = self.timeout;
+        let io = |e: std::io::Error| Failed::Other(e.to_string());
+        match &mut self.wire {
+            Wire::Tcp { stream, transaction } => {
+                *transaction = transaction.wrapping_add(1);
+                let mut frame = [0; mbap::MAX_ADU];
+                let len = mbap::encode(*transaction, unit, pdu, &mut frame).unwrap_or(0);
+                stream.write_all(&frame[..len]).map_err(io)?;
+                let sent = *transaction;
+                read_stream(stream, timeout, |bytes| loop {
+                    match mbap::scan(bytes) {
+                        Scan::Frame { frame, .. } if frame.transaction == sent && frame.unit == unit => {
+                            return Some(Ok(frame.pdu.to_vec()));
+                        }
+                        // A late answer to an earlier request.
+                        Scan::Frame { used, .. } | Scan::Foreign { used } => {
+                            bytes.drain(..used);
+                        }
+                        Scan::Incomplete => return None,
+                        Scan::BadLength { length } => {
+                            return Some(Err(format!("the answer has an impossible length, {length}")));
+                        }
+                    }
+                })
+            }
+            Wire::RtuOverTcp(stream) => {
+                let mut frame = [0; rtu::MAX_ADU];
+                let len = rtu::encode(unit, pdu, &mut frame);
+                stream.write_all(&frame[..len]).map_err(io)?;
+                if unit == 0 {
+                    return Ok(Vec::new());
+                }
+                read_stream(stream, timeout, |bytes| found_rtu(unit, pdu, bytes).map(Ok))
+            }
+            Wire::Serial { port, ascii, char_ns, t35 } => {
+                let (ascii, char_ns, t35) = (*ascii, *char_ns, *t35);
+                // What came unasked is no answer.
+                let mut some = [0; 512];
+                while matches!(port.read(&mut some).map_err(io)?, PortRead::Bytes(..)) {}
+                std::thread::sleep(t35);
+                let frame = if ascii {
+                    let mut frame = [0; ascii::MAX_ADU];
+                    let len = ascii::encode(unit, pdu, &mut frame);
+                    frame[..len].to_vec()
+                } else {
+                    let mut frame = [0; rtu::MAX_ADU];
+                    let len = rtu::encode(unit, pdu, &mut frame);
+                    frame[..len].to_vec()
+                };
+                send_serial(port, &frame, char_ns).map_err(io)?;
+                if unit == 0 {
+                    // Units carry it out; nobody answers.
+                    std::thread::sleep(Duration::from_millis(200));
+                    return Ok(Vec::new());
+                }
+                read_serial(port, timeout, |bytes| {
+                    if ascii { found_ascii(unit, bytes) } else { found_rtu(unit, pdu, bytes) }
+                })
+            }
+            Wire::Service { .. } => Err(Failed::Other("a service takes jobs".to_owned())),
+        }
+    }
+}
+
+fn connect(address: &str, port: u16, timeout: Duration) -> anyhow::Result<TcpStream> {
+    let address = address.trim_end_matches('/');
+    let whole = match address.rsplit_once(':') {
+        Some((_, digits)) if digits.parse::<u16>().is_ok() => address.to_owned(),
+        _ => format!("{address}:{port}"),
+    };
+    let mut last = None;
+    for resolved in whole.to_socket_addrs().with_context(|| format!("'{whole}' is no address"))? {
+        match TcpStream::connect_timeout(&resolved, timeout.max(Duration::from_millis(100))) {
+            Ok(stream) => {
+                stream.set_nodelay(true)?;
+                return Ok(stream);
+            }
+            Err(e) => last = Some(e),
+        }
+    }
+    let cause = last.map_or_else(|| "no such host".to_owned(), |e| e.to_string());
+    anyhow::bail!("connecting to {whole}: {cause}; is the device on, the port right, a filter in between?")
+}
+
+/// `/dev/ttyUSB0?baud=9600&parity=none&stop=2&data=8`.
+fn serial(text: &str, ascii: bool) -> anyhow::Result<Wire> {
+    let (device, query) = text.split_once('?').unwrap_or((text, ""));
+    let mut config = SerialConfig::of_device(device);
+    config.framing = if ascii { Framing::Ascii } else { Framing::Rtu };
+    for pair in query.split('&').filter(|pair| !pair.is_empty()) {
+        let (key, value) = pair.split_once('=').unwrap_or((pair, ""));
+        let wrong = || UsageError(format!("'{pair}': write baud=9600, parity=none|even|odd, stop=1|2, data=7|8"));
+        match key {
+            "baud" => config.baud = Some(value.parse().map_err(|_| wrong())?),
+            "parity" => {
+                config.parity = Some(serde_json::from_value(Value::from(value)).map_err(|_| wrong())?);
+            }
+            "stop" | "stop_bits" => config.stop_bits = Some(value.parse().map_err(|_| wrong())?),
+            "data" | "data_bits" => config.data_bits = Some(value.parse().map_err(|_| wrong())?),
+            _ => return Err(wrong().into()),
+        }
+    }
+    let options = config
+        .options(Path::new("."))
+        .ok_or_else(|| UsageError(format!("'{device}' is no device: write rtu:///dev/ttyUSB0")))?;
+    let port = Port::open(&options)?;
+    for note in port.notes() {
+        eprintln!("dinrail: {note}");
+    }
+    let timing = config.timing();
+    Ok(Wire::Serial { port, ascii, char_ns: timing.char_ns, t35: Duration::from_nanos(timing.t35_ns) })
+}
+
+fn service(name: &str, stack: Option<&str>) -> anyhow::Result<Wire> {
+    let mut ctx = observe(&find(stack)?).context("asking a modbus-client of a running stack")?;
+    let known: Vec<&str> =
+        ctx.stack.services.iter().filter(|s| s.kind == "modbus-client").map(|s| s.name.as_str()).collect();
+    if !known.contains(&name) {
+        let list = if known.is_empty() { "none".to_owned() } else { known.join(", ") };
+        anyhow::bail!(
+            "stack '{}' has no modbus-client '{name}'; it has {list}. A device is written tcp://HOST or rtu:///dev/...",
+            ctx.stack.name
+        );
+    }
+    // First the ear, then the mouth: the answer may come at once.
+    let results = ctx.subscriber::<JobResult>(&TopicKind::Results.of(name))?;
+    let jobs = ctx.publisher::<Job>(&TopicKind::Jobs.of(name))?;
+    Ok(Wire::Service { name: name.to_owned(), writer: ctx.writer, jobs, results })
+}
+
+fn through_service(
+    name: &str,
+    writer: u32,
+    jobs: &mut Publisher<Job>,
+    results: &mut Subscriber<JobResult>,
+    job: &Value,
+) -> Result<Value, Failed> {
+    let other = |e: &dyn std::fmt::Display| Failed::Other(e.to_string());
+    let header =
+        Job { deadline_t_ns: clock::mono_ns() + SERVICE_LIMIT.as_nanos() as u64, ..Job::default() };
+    let text = serde_json::to_vec(job).map_err(|e| other(&e))?;
+    let seq = jobs.send_tail(header, &text).map_err(|e| other(&e))?;
+    jobs.ring();
+    let begin = Instant::now();
+    loop {
+        let mut answer = None;
+        results.drain(64, |result, tail| {
+            if result.job_seq == seq && result.job_writer == writer {
+                answer = Some((result.code, serde_json::from_slice::<Value>(tail).unwrap_or(Value::Null)));
+            }
+        });
+        match answer {
+            Some((0, body)) => return Ok(body.get("ok").cloned().unwrap_or(body)),
+            Some((_, body)) => {
+                let text = body.get("error").and_then(Value::as_str).unwrap_or("it failed").to_owned();
+                let code = text.strip_prefix("exception ").and_then(|rest| u8::from_str_radix(rest.get(..2)?, 16).ok());
+                return Err(match code {
+                    Some(code) => Failed::Exception(code, text),
+                    None if text.starts_with("no answer") => Failed::NoAnswer(text),
+                    None => Failed::Other(text),
+                });
+            }
+            None if begin.elapsed() > SERVICE_LIMIT => {
+                return Err(Failed::Other(format!("service '{name}' did not answer; see `dinrail ps`")));
+            }
+            None => std::thread::sleep(LOOK),
+        }
+    }
+}
+
+/// Reads until `found` has something or the time is over.
+fn read_stream(
+    stream: &mut TcpStream,
+    timeout: Duration,
+    mut found: impl FnMut(&mut Vec<u8>) -> Option<Result<Vec<u8>, String>>,
+) -> Result<Vec<u8>, Failed> {
+    let end = Instant::now() + timeout;
+    let mut bytes = Vec::new();
+    let mut some = [0; 512];
+    loop {
+        let left = end.saturating_duration_since(Instant::now());
+        if left.is_zero() {
+            return Err(silent(timeout, bytes.len()));
+        }
+        stream.set_read_timeout(Some(left)).map_err(|e| Failed::Other(e.to_string()))?;
+        match stream.read(&mut some) {
+            Ok(0) => return Err(Failed::Other("the other side closed the connection".to_owned())),
+            Ok(n) => bytes.extend_from_slice(&some[..n]),
+            Err(e) if matches!(e.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut) => {
+                return Err(silent(timeout, bytes.len()));
+            }
+            Err(e) if e.kind() == std::io::ErrorKind::Interrupted => {}
+            Err(e) => return Err(Failed::Other(e.to_string())),
+        }
+        if let Some(result) = found(&mut bytes) {
+            return result.map_err(Failed::Other);
+        }
+    }
+}
+
+fn silent(timeout: Duration, bytes: usize) -> Failed {
+    if bytes == 0 {
+        Failed::NoAnswer(format!("no answer within {timeout:?}"))
+    } else {
+        Failed::NoAnswer(format!("{bytes} bytes came within {timeout:?} that are no answer"))
+    }
+}
+
+fn send_serial(port: &mut Port, frame: &[u8], char_ns: u64) -> std::io::Result<()> {
+    port.transmitter(true)?;
+    let mut left = frame;
+    let end = Instant::now() + Duration::from_secs(5) + Duration::from_nanos(char_ns * frame.len() as u64);
+    while !left.is_empty() || !port.is_drained()? {
+        let n = if left.is_empty() { 0 } else { port.write(left)? };
+        left = &left[n..];
+        if Instant::now() > end {
+            return Err(std::io::ErrorKind::TimedOut.into());
+        }
+        if n == 0 {
+            std::thread::sleep(Duration::from_micros(200));
+        }
+    }
+    port.transmitter(false)
+}
+
+fn read_serial(
+    port: &mut Port,
+    timeout: Duration,
+    mut found: impl FnMut(&mut Vec<u8>) -> Option<Vec<u8>>,
+) -> Result<Vec<u8>, Failed> {
+    let end = Instant::now() + timeout;
+    let mut bytes = Vec::new();
+    let mut some = [0; 512];
+    let other = |e: std::io::Error| Failed::Other(e.to_string());
+    loop {
+        let left = end.saturating_duration_since(Instant::now());
+        if left.is_zero() {
+            return Err(silent(timeout, bytes.len()));
+        }
+        let wait = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: i64::from(left.subsec_nanos()) };
+        let mut fds = [PollFd::from_borrowed_fd(port.fd(), PollFlags::IN)];
+        let _ = poll(&mut fds, Some(&wait));
+        match port.read(&mut some).map_err(other)? {
+            PortRead::Bytes(n, _) => bytes.extend_from_slice(&some[..n]),
+            PortRead::Nothing => {}
+            PortRead::Nobody => std::thread::sleep(Duration::from_millis(5)),
+        }
+        if let Some(pdu) = found(&mut bytes) {
+            return Ok(pdu);
+        }
+    }
+}
+
+/// The answer of the unit in a stream of RTU bytes, wherever it begins.
+fn found_rtu(unit: u8, request: &[u8], bytes: &[u8]) -> Option<Vec<u8>> {
+    (0..bytes.len()).filter(|&start| bytes[start] == unit).find_map(|start| {
+        let rest = &bytes[start..];
+        let end = match length(request, &rest[1..]) {
+            Length::Exactly(len) => len + 3,
+            Length::AtLeast(_) => return None,
+            Length::Unknown => rest.len(),
+        };
+        let (_, pdu) = rtu::decode(rest.get(..end)?).ok()?;
+        (fit(request, pdu) != Fit::No).then(|| pdu.to_vec())
+    })
+}
+
+/// The answer of the unit in a stream of ASCII characters.
+fn found_ascii(unit: u8, bytes: &[u8]) -> Option<Vec<u8>> {
+    let end = bytes.iter().position(|&b| b == b'\n')? + 1;
+    let start = bytes[..end].iter().rposition(|&b| b == b':')?;
+    let mut out = [0; 256];
+    let (from, pdu) = ascii::decode(&bytes[start..end], &mut out).ok()?;
+    (from == unit).then(|| pdu.to_vec())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn answers_are_found_behind_noise() {
+        let mut frame = [0; rtu::MAX_ADU];
+        let len = rtu::encode(5, &[3, 2, 0, 7], &mut frame);
+        let request = [3, 0, 0, 0, 1];
+        let mut bytes = vec![0, 5, 9];
+        assert_eq!(found_rtu(5, &request, &bytes), None);
+        bytes.extend(&frame[..len]);
+        assert_eq!(found_rtu(5, &request, &bytes), Some(vec![3, 2, 0, 7]));
+        assert_eq!(found_rtu(6, &request, &bytes), None);
+        let mut frame = [0; ascii::MAX_ADU];
+        let len = ascii::encode(5, &[3, 2, 0, 7], &mut frame);
+        let mut bytes = b":05".to_vec();
+        bytes.extend(&frame[..len]);
+        assert_eq!(found_ascii(5, &bytes), Some(vec![3, 2, 0, 7]));
+        assert_eq!(found_ascii(5, &bytes[..bytes.len() - 1]), None);
+    }
+}

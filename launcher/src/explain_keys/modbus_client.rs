@@ -1,0 +1,188 @@
+//! Keys of kinds `modbus-client` and `modbus-gateway`.
+
+#[allow(clippy::enum_glob_use, reason = "tables of one line a key")]
+use super::ValueKind::*;
+use super::{KeyDoc, ValueKind, may, need, with};
+
+const TABLES: ValueKind = Choice(&["coils", "discrete_inputs", "input_registers", "holding_registers"]);
+const ORDERS: ValueKind = Choice(&["AB", "BA", "ABCD", "DCBA", "BADC", "CDAB"]);
+const TYPES: ValueKind = Choice(&[
+    "BOOL", "BYTE", "USINT", "SINT", "WORD", "UINT", "INT", "DWORD", "UDINT", "DINT", "REAL", "LWORD", "ULINT", "LINT",
+    "LREAL",
+]);
+const UNIT: ValueKind = OneOf(&[Int(0, 255), Text]);
+const ORDER_MEANING: &str = "Order of the bytes on the wire, A the most significant: AB and BA for single registers, ABCD (high word first), CDAB (low word first), BADC and DCBA (the same with the bytes of each register exchanged) for %xD and %xL.";
+
+/// Keys of kind `modbus-client`.
+pub const MODBUS_CLIENT: &[KeyDoc] = &[
+    may("plc", Service("plc"), "the only plc of the stack", "The plc service whose image is exchanged."),
+    may("serial", Service("serial"), "no serial line", "The serial service whose line is used, by this master alone."),
+    may("tcp", Socket, "no connection", "The server to connect to; instead of `serial`."),
+    may(
+        "mode",
+        Choice(&["tcp", "rtu", "ascii"]),
+        "rtu on a serial line, tcp on a connection",
+        "How frames look: \"tcp\" with an MBAP header, \"rtu\" with a CRC (on a connection: RTU over TCP), \"ascii\".",
+    ),
+    with(
+        "response_timeout",
+        Duration,
+        "\"1s\"",
+        "How long an answer is waited for, from the end of the request.",
+    ),
+    with("retries", Int(0, 255), "1", "Repetitions of a request without an answer."),
+    with(
+        "probe_min",
+        Duration,
+        "\"1s\"",
+        "First pause between tries of a unit that does not answer; it doubles each time, and is at least 25 times what a try costs while other units are alive.",
+    ),
+    with("probe_max", Duration, "\"1min\"", "Longest such pause."),
+    with(
+        "turnaround",
+        Duration,
+        "\"200ms\"",
+        "Pause after a broadcast on a serial line, in which units carry it out.",
+    ),
+    with(
+        "max_gap",
+        Int(0, 65535),
+        "8",
+        "Reads are put together into one request when no more than so many registers or bits lie between them.",
+    ),
+    with("max_batch", Int(1, 125), "125", "Most registers of a request that is put together; 16 times as many bits."),
+    with("connect_timeout", Duration, "\"2s\"", "How long a connection may take to be made."),
+    with(
+        "stale_after",
+        Duration,
+        "\"200ms\"",
+        "Age of the image above which writes go to their safe state. At least three times `max_interval` of the plc.",
+    ),
+    with(
+        "safe_on",
+        List(&Choice(&["stop", "fault", "halted"])),
+        "[\"stop\", \"fault\", \"halted\"]",
+        "States of the plc in which writes go to their safe state. A stale image always does that.",
+    ),
+    with("unit", Tables, "[]", "What differs for a unit: a name, a connection of its own, times."),
+    need("unit[].id", Int(0, 255), "Unit id."),
+    may("unit[].name", Text, "no name", "A name for `read`, `write`, jobs and messages."),
+    may("unit[].tcp", Socket, "the line of the service", "A connection of its own."),
+    may("unit[].response_timeout", Duration, "that of the service", "How long its answers are waited for."),
+    may("unit[].retries", Int(0, 255), "those of the service", "Repetitions of its requests."),
+    with("read", Tables, "[]", "What is read into %I."),
+    need("read[].unit", UNIT, "Unit id, or the name of a [[service.unit]]."),
+    need("read[].table", TABLES, "The Modbus table."),
+    need("read[].at", Int(0, 65535), "First address, counted from 0 as on the wire."),
+    may("read[].count", Int(1, 2000), "one value of the width of `to`", "Number of bits or registers."),
+    need("read[].to", Address, "Place in %I: X or B for bits, B, W, D or L for registers."),
+    with("read[].order", ORDERS, "\"ABCD\"", ORDER_MEANING),
+    with("read[].period", Duration, "\"1s\"", "How often it is read; \"0s\" = as often as the line allows."),
+    may("read[].type", TYPES, "by the width of `to`", "IEC type of the symbol."),
+    may("read[].symbol", Text, "no symbol", "Name of a global variable for the program; for a single value."),
+    may(
+        "read[].timeout",
+        Duration,
+        "three periods and the time of all tries",
+        "Values older than this are bad. A failed request makes them bad at once.",
+    ),
+    with("read[].on_bad", Choice(&["hold", "zero"]), "\"hold\"", "Value while bad: the last one, or 0."),
+    may("read[].status_to", Address, "not shown", "%IB that shows the quality to the program: 0 good, 1 stale, 2 no data, 3 owner dead."),
+    with("write", Tables, "[]", "What is written from %Q or %M. Writes go before reads."),
+    need("write[].unit", UNIT, "Unit id, or the name of a [[service.unit]]; 0 on a serial line is a broadcast."),
+    need("write[].table", TABLES, "coils or holding_registers."),
+    need("write[].at", Int(0, 65535), "First address, counted from 0 as on the wire."),
+    may("write[].count", Int(1, 1968), "one value of the width of `from`", "Number of bits or registers."),
+    need("write[].from", Address, "Place in %Q or %M."),
+    with("write[].order", ORDERS, "\"ABCD\"", ORDER_MEANING),
+    with("write[].on_change", Bool, "true", "Written when it changed, and once at the start."),
+    may("write[].period", Duration, "on change only", "Written at least this often."),
+    with(
+        "write[].function",
+        Choice(&["auto", "multiple"]),
+        "\"auto\"",
+        "\"auto\": functions 5 and 6 for single entries, 15 and 16 for several; \"multiple\": 15 and 16 always.",
+    ),
+    may("write[].type", TYPES, "by the width of `from`", "IEC type of the symbol and of `safe_values`."),
+    may("write[].symbol", Text, "no symbol", "Name of a global variable for the program; for a single value."),
+    may(
+        "write[].safe_values",
+        List(&Number),
+        "nothing is written any more",
+        "Written once when the image is stale or the plc does not run: one number a value.",
+    ),
+];
+
+/// Keys of kind `modbus-gateway`.
+pub const MODBUS_GATEWAY: &[KeyDoc] = &[
+    with("tcp", Table, "{}", "Where masters connect, and who may."),
+    with("tcp.address", Ip, "\"0.0.0.0\"", "Address of this machine to listen on."),
+    with("tcp.port", Int(0, 65535), "502", "TCP port. The launcher opens it, so 502 needs privilege there only."),
+    with("tcp.max_connections", Int(1, 1024), "8", "Most masters at once."),
+    may(
+        "tcp.filter",
+        OneOf(&[Table, Tables]),
+        "everybody may connect",
+        "Who may connect besides loopback: a range, or rules of which the first that matches decides.",
+    ),
+    need("tcp.filter.mask", Ip, "Bits of the address that must equal those of `start`."),
+    need("tcp.filter.start", Ip, "First address that may connect."),
+    need("tcp.filter.end", Ip, "Last address that may connect."),
+    with("tcp.filter[].mask", Ip, "\"0.0.0.0\"", "Bits of the address that must equal those of `start`."),
+    need("tcp.filter[].start", Ip, "First address of the rule."),
+    need("tcp.filter[].end", Ip, "Last address of the rule."),
+    with("tcp.filter[].allow", Bool, "true", "Whether the rule admits or refuses."),
+    with("tcp.idle_timeout", Duration, "\"60s\"", "A connection without a request for so long is closed; \"0s\" = never."),
+    with(
+        "tcp.when_full",
+        Choice(&["refuse", "close_oldest_idle"]),
+        "\"refuse\"",
+        "What a new master gets when `tcp.max_connections` is reached: refused, or the place of the one idle longest.",
+    ),
+    may(
+        "serial",
+        Service("serial"),
+        "only the lines of `port`",
+        "The serial service whose units have the same ids on both sides.",
+    ),
+    with("mode", Choice(&["rtu", "ascii"]), "\"rtu\"", "How frames look on that line."),
+    with("port", Tables, "[]", "More lines."),
+    need("port[].serial", Service("serial"), "The serial service."),
+    with("port[].mode", Choice(&["rtu", "ascii"]), "\"rtu\"", "How frames look on the line."),
+    may("port[].response_timeout", Duration, "that of the gateway", "How long answers on this line are waited for."),
+    with("units", Tables, "[]", "Units whose id differs, or that are on another line than `serial`."),
+    need("units[].tcp", Int(0, 255), "Unit id that masters use."),
+    may("units[].line", Int(0, 247), "the same", "Address on the line."),
+    may("units[].port", Service("serial"), "`serial`", "The line."),
+    with("only_units", Bool, "false", "Only the units of `units` are reached; all others get exception 0A."),
+    with(
+        "response_timeout",
+        Duration,
+        "\"1s\"",
+        "How long a unit is waited for, from the end of the request; then the master gets exception 0B.",
+    ),
+    with("retries", Int(0, 255), "0", "Repetitions of a request without an answer; masters repeat by themselves."),
+    with("turnaround", Duration, "\"200ms\"", "Pause after a broadcast."),
+    with("queue", Int(1, 64), "32", "Requests of all masters that may wait for a line; beyond it exception 06."),
+    with("max_wait", Duration, "\"5s\"", "A request that waited for longer gets exception 06."),
+    with(
+        "broadcast",
+        Choice(&["silent", "answer"]),
+        "\"silent\"",
+        "What a master gets for a broadcast (unit 0): nothing, or the confirmation a unit would have given.",
+    ),
+    with(
+        "probe_min",
+        Duration,
+        "\"1s\"",
+        "A unit that did not answer is not tried again for so long, doubled each time; requests get exception 0B at once.",
+    ),
+    with("probe_max", Duration, "\"1min\"", "Longest such pause."),
+    with("cache", Tables, "[]", "Ranges that the gateway reads by itself and answers from memory."),
+    need("cache[].unit", Int(0, 255), "Unit id that masters use."),
+    need("cache[].table", TABLES, "The Modbus table."),
+    need("cache[].at", Int(0, 65535), "First address, counted from 0."),
+    need("cache[].count", Int(1, 2000), "Number of bits or registers, at most 125 registers."),
+    with("cache[].period", Duration, "\"1s\"", "How often it is read."),
+    may("cache[].max_age", Duration, "three periods", "Older values are read from the unit."),
+];
