@@ -357,3 +357,69 @@ seed("stack_file", "plc.toml", '[stack]\nname = "p"\n[[service]]\nname = "plc"\n
      'max_interval = "20ms"\n[[service.route]]\nfrom = "%MW0"\nto = "%QW0"\nscale = 0.5\noffset = 1\n')
 seed("stack_file", "mistakes.toml", '[stack]\nnam = "x"\n[[service]]\nname = "can0"\nkind = "cna"\nbitrate = 500\n'
      '[[service]]\nname = "can0"\nkind = "can"\nbackend = "socketcan"\nbitrat = "1M"\n')
+
+# --- CANopen ---------------------------------------------------------------------------------------------------
+
+# Each: who hears (0 server, 1 client), 10 ms of silence before, the frame.
+def sdo(*steps: str) -> bytes:
+    return b"".join(bytes.fromhex(step) for step in steps)
+
+
+seed("sdo_server", "expedited", sdo("00 00 4000100000000000", "00 00 2301200001020304", "01 00 6000200000000000"))
+seed("sdo_server", "segmented", sdo("00 00 2100200008000000", "00 00 0061626364656667", "00 00 1D68000000000000",
+                                    "00 00 4002200000000000", "00 00 6000000000000000", "00 64 7000000000000000"))
+seed("sdo_server", "block", sdo("00 00 C600200008000000", "00 00 0161626364656667", "00 00 8268000000000000", "00 00 D900000000000000",
+                                "00 00 A402200014000000", "00 00 A300000000000000", "00 00 A202140000000000", "00 00 A100000000000000"))
+
+EDS = """[FileInfo]
+FileName=seed.eds
+[DeviceInfo]
+VendorName=seed
+Granularity=8
+NrOfRXPDO=1
+CompactPDO=3
+[DummyUsage]
+Dummy0005=1
+[Comments]
+Lines=1
+Line1=none
+[MandatoryObjects]
+SupportedObjects=1
+1=0x1000
+[1000]
+ParameterName=Device type
+ObjectType=0x7
+DataType=0x0007
+AccessType=ro
+DefaultValue=0x191
+[2000]
+ParameterName=List
+ObjectType=8
+CompactSubObj=3
+DataType=0x3
+AccessType=rw
+LowLimit=-5
+HighLimit=0x7F
+[2000Name]
+NrOfEntries=1
+1=First
+[2001]
+ParameterName=Record
+ObjectType=9
+SubNumber=2
+[2001sub0]
+ParameterName=Highest
+DataType=5
+AccessType=const
+DefaultValue=1
+[2001sub1]
+ParameterName=COB-ID
+DataType=7
+AccessType=rw
+PDOMapping=1
+DefaultValue=$NODEID+0x180
+ParameterValue=010
+"""
+seed("eds", "small", EDS)
+seed("dcf", "small", EDS + "[2000Value]\nNrOfEntries=1\n2=-3\n[DeviceComissioning]\nNodeID=5\nBaudrate=250\n")
+seed("concise_dcf", "two", pack("<IHBIH", 2, 0x1017, 0, 2, 1000) + pack("<HBII", 0x1400, 1, 4, 0x80000205))

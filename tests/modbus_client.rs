@@ -140,7 +140,9 @@ fn a_tcp_server_is_polled_dies_and_comes_back() {
 fn rtu_and_ascii_on_a_serial_line() {
     for mode in ["rtu", "ascii"] {
         let toml = CLIENT.replace("LINE", &format!("serial = \"com1\"\nmode = \"{mode}\""))
-            + &format!("\n[[service]]\nname = \"com1\"\nkind = \"serial\"\ndevice = \"pty:line\"\nframing = \"{mode}\"\n");
+            + &format!(
+                "\n[[service]]\nname = \"com1\"\nkind = \"serial\"\ndevice = \"pty:line\"\nframing = \"{mode}\"\n"
+            );
         let stack = Stack::up(&format!("mb{mode}"), &toml, &[]);
         let line = stack.scratch.0.join("line");
         wait_for("the pseudo-terminal", PATIENCE, || line.exists().then_some(()));
@@ -266,7 +268,9 @@ fn rogue(script: Vec<&'static str>) -> u16 {
                 let (own, right) = ([head[0], head[1]], [3, 2, 0, 9]);
                 let sent = match script.next().unwrap_or("right") {
                     "right" => stream.write_all(&answer(own, &right)),
-                    "other transaction" => stream.write_all(&answer([head[0], head[1] ^ 0x55], &[3, 2, 6, 6])),
+                    "other transaction" => {
+                        stream.write_all(&answer([head[0], head[1] ^ 0x55], &[3, 2, 6, 6]))
+                    }
                     "other function" => stream.write_all(&answer(own, &[4, 2, 6, 6])),
                     "wrong count" => stream.write_all(&answer(own, &[3, 4, 6, 6, 6, 6])),
                     "noise" => stream.write_all(&[0xFF; 40]),
@@ -290,8 +294,19 @@ fn rogue(script: Vec<&'static str>) -> u16 {
 #[test]
 fn a_server_that_answers_nonsense_or_late_never_gives_a_wrong_value() {
     let script = vec![
-        "right", "other transaction", "right", "other function", "wrong count", "right", "noise", "late", "half",
-        "close", "right", "late", "other transaction",
+        "right",
+        "other transaction",
+        "right",
+        "other function",
+        "wrong count",
+        "right",
+        "noise",
+        "late",
+        "half",
+        "close",
+        "right",
+        "late",
+        "other transaction",
     ];
     let port = rogue(script);
     let toml = format!(
@@ -340,7 +355,8 @@ fn the_command_line_alone_reads_a_device() {
     let target = format!("tcp://127.0.0.1:{port}");
     let run = |args: &[&str]| {
         let output = dinrail().args(["modbus"]).args(args).output().unwrap();
-        let text = String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr);
+        let text =
+            String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr);
         (output.status.success(), text)
     };
     let (ok, text) = run(&["read", &target, "40001x3", "30011:int16", "Coil=00002"]);

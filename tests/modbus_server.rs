@@ -87,7 +87,11 @@ fn path(stack: &Stack, port: &str) -> String {
 fn run_peer(script: &str, args: &[&str]) -> Option<String> {
     let output = peers::peer(script)?.args(args).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
-    assert!(output.status.success(), "{script} {args:?}: {text}\n{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.status.success(),
+        "{script} {args:?}: {text}\n{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     Some(text)
 }
 
@@ -118,9 +122,14 @@ fn foreign_masters_on_every_transport() {
 fn mbpoll(args: &[&str]) {
     let Some(mut mbpoll) = peers::program("mbpoll", "mbpoll") else { return };
     let (target, options) = args.split_last().unwrap();
-    let output = mbpoll.args(options).args(["-0", "-r", "7", "-c", "1", "-t", "4", "-1", target]).output().unwrap();
+    let output =
+        mbpoll.args(options).args(["-0", "-r", "7", "-c", "1", "-t", "4", "-1", target]).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
-    assert!(text.contains("[7]: \t4711"), "mbpoll {args:?}: {text}{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        text.contains("[7]: \t4711"),
+        "mbpoll {args:?}: {text}{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
 }
 
 /// PDUs of the matrix of disagreements that need no state, and what V1.1b3 asks for.
@@ -262,21 +271,24 @@ fn recorded_traffic_gets_the_answers_of_the_specification() {
 /// Sends every whole request to port 502 of a capture, each on its own connection, and checks that the answer can be
 /// one to it. Returns how many.
 fn replay(pcap: &[u8], port: u16) -> usize {
+    use dinrail_modbus::protocol::decode_response;
     use dinrail_modbus::protocol::mbap::{Scan, scan};
     use dinrail_modbus::protocol::pdu::decode_request;
-    use dinrail_modbus::protocol::decode_response;
     let mut asked = 0;
     for payload in support::pcap::tcp_payloads_to(pcap, 502) {
         let Scan::Frame { frame, used } = scan(&payload) else { continue };
         let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
         stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
         stream.write_all(&payload[..used]).unwrap();
-        let silent = frame.pdu.starts_with(&[8, 0, 4]);
-        if silent {
+        if frame.pdu.starts_with(&[8, 0, 4]) {
+            // Listen-only mode: only a restart ends it, without an answer.
+            stream.write_all(&tcp_frame(1, &[8, 0, 1, 0, 0])).unwrap();
+            stream.write_all(&tcp_frame(2, &[8, 0, 0, 7, 7])).unwrap();
+            stream.read_exact(&mut [0; 12]).unwrap();
             continue;
         }
         let mut head = [0; 6];
-        stream.read_exact(&mut head).unwrap();
+        stream.read_exact(&mut head).unwrap_or_else(|e| panic!("{frame:02X?} has no answer: {e}"));
         let mut body = vec![0; usize::from(head[5])];
         stream.read_exact(&mut body).unwrap();
         assert_eq!(body[0], frame.unit);

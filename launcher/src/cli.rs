@@ -88,6 +88,9 @@ pub enum Command {
     /// See, send, generate and replay CAN frames
     #[command(subcommand)]
     Can(CanCommand),
+    /// See and command a CANopen network, read and write objects
+    #[command(subcommand)]
+    Canopen(crate::commands::canopen::CanopenCommand),
     /// Read and write Modbus devices, find and identify them
     #[command(subcommand)]
     Modbus(crate::commands::modbus::ModbusCommand),

@@ -12,6 +12,7 @@ mod idle;
 mod latency;
 mod machine;
 mod modbus;
+mod modbus_lines;
 mod recorder;
 mod restart;
 mod scan;
@@ -50,7 +51,7 @@ pub enum What {
     Latency,
     /// Frames a second and round trips on a virtual bus, beside python-can's; the driver's CPU on a full bus
     Bus,
-    /// Modbus TCP answers, against a libmodbus server
+    /// Modbus TCP answers beside libmodbus and pymodbus, gateway, RTU line
     Modbus,
     /// A scan of 1000 instructions
     Scan,

@@ -4,6 +4,7 @@
 pub mod bench;
 mod build;
 pub mod can;
+pub mod canopen;
 mod check;
 mod down;
 mod explain;
@@ -58,6 +59,7 @@ pub fn run(cli: Cli) -> ExitCode {
         Command::Modbus(command) => done(modbus::run(command, json)),
         Command::Serial(command) => done(serial::run(command, json)),
         Command::Can(command) => can::run(command, json),
+        Command::Canopen(command) => canopen::run(command, json),
         Command::Plc { service, stack, command } => {
             done(plc::run(service.as_deref(), stack.as_deref(), command, json))
         }

@@ -7,8 +7,8 @@ use super::{KeyDoc, ValueKind, may, need, with};
 const TABLES: ValueKind = Choice(&["coils", "discrete_inputs", "input_registers", "holding_registers"]);
 const ORDERS: ValueKind = Choice(&["AB", "BA", "ABCD", "DCBA", "BADC", "CDAB"]);
 const TYPES: ValueKind = Choice(&[
-    "BOOL", "BYTE", "USINT", "SINT", "WORD", "UINT", "INT", "DWORD", "UDINT", "DINT", "REAL", "LWORD", "ULINT", "LINT",
-    "LREAL",
+    "BOOL", "BYTE", "USINT", "SINT", "WORD", "UINT", "INT", "DWORD", "UDINT", "DINT", "REAL", "LWORD",
+    "ULINT", "LINT", "LREAL",
 ]);
 const UNIT: ValueKind = OneOf(&[Int(0, 255), Text]);
 const ORDER_MEANING: &str = "Order of the bytes on the wire, A the most significant: AB and BA for single registers, ABCD (high word first), CDAB (low word first), BADC and DCBA (the same with the bytes of each register exchanged) for %xD and %xL.";
@@ -16,7 +16,12 @@ const ORDER_MEANING: &str = "Order of the bytes on the wire, A the most signific
 /// Keys of kind `modbus-client`.
 pub const MODBUS_CLIENT: &[KeyDoc] = &[
     may("plc", Service("plc"), "the only plc of the stack", "The plc service whose image is exchanged."),
-    may("serial", Service("serial"), "no serial line", "The serial service whose line is used, by this master alone."),
+    may(
+        "serial",
+        Service("serial"),
+        "no serial line",
+        "The serial service whose line is used, by this master alone.",
+    ),
     may("tcp", Socket, "no connection", "The server to connect to; instead of `serial`."),
     may(
         "mode",
@@ -50,7 +55,12 @@ pub const MODBUS_CLIENT: &[KeyDoc] = &[
         "8",
         "Reads are put together into one request when no more than so many registers or bits lie between them.",
     ),
-    with("max_batch", Int(1, 125), "125", "Most registers of a request that is put together; 16 times as many bits."),
+    with(
+        "max_batch",
+        Int(1, 125),
+        "125",
+        "Most registers of a request that is put together; 16 times as many bits.",
+    ),
     with("connect_timeout", Duration, "\"2s\"", "How long a connection may take to be made."),
     with(
         "stale_after",
@@ -87,9 +97,18 @@ pub const MODBUS_CLIENT: &[KeyDoc] = &[
         "Values older than this are bad. A failed request makes them bad at once.",
     ),
     with("read[].on_bad", Choice(&["hold", "zero"]), "\"hold\"", "Value while bad: the last one, or 0."),
-    may("read[].status_to", Address, "not shown", "%IB that shows the quality to the program: 0 good, 1 stale, 2 no data, 3 owner dead."),
+    may(
+        "read[].status_to",
+        Address,
+        "not shown",
+        "%IB that shows the quality to the program: 0 good, 1 stale, 2 no data, 3 owner dead.",
+    ),
     with("write", Tables, "[]", "What is written from %Q or %M. Writes go before reads."),
-    need("write[].unit", UNIT, "Unit id, or the name of a [[service.unit]]; 0 on a serial line is a broadcast."),
+    need(
+        "write[].unit",
+        UNIT,
+        "Unit id, or the name of a [[service.unit]]; 0 on a serial line is a broadcast.",
+    ),
     need("write[].table", TABLES, "coils or holding_registers."),
     need("write[].at", Int(0, 65535), "First address, counted from 0 as on the wire."),
     may("write[].count", Int(1, 1968), "one value of the width of `from`", "Number of bits or registers."),
@@ -104,7 +123,12 @@ pub const MODBUS_CLIENT: &[KeyDoc] = &[
         "\"auto\": functions 5 and 6 for single entries, 15 and 16 for several; \"multiple\": 15 and 16 always.",
     ),
     may("write[].type", TYPES, "by the width of `from`", "IEC type of the symbol and of `safe_values`."),
-    may("write[].symbol", Text, "no symbol", "Name of a global variable for the program; for a single value."),
+    may(
+        "write[].symbol",
+        Text,
+        "no symbol",
+        "Name of a global variable for the program; for a single value.",
+    ),
     may(
         "write[].safe_values",
         List(&Number),
@@ -117,7 +141,12 @@ pub const MODBUS_CLIENT: &[KeyDoc] = &[
 pub const MODBUS_GATEWAY: &[KeyDoc] = &[
     with("tcp", Table, "{}", "Where masters connect, and who may."),
     with("tcp.address", Ip, "\"0.0.0.0\"", "Address of this machine to listen on."),
-    with("tcp.port", Int(0, 65535), "502", "TCP port. The launcher opens it, so 502 needs privilege there only."),
+    with(
+        "tcp.port",
+        Int(0, 65535),
+        "502",
+        "TCP port. The launcher opens it, so 502 needs privilege there only.",
+    ),
     with("tcp.max_connections", Int(1, 1024), "8", "Most masters at once."),
     may(
         "tcp.filter",
@@ -132,7 +161,12 @@ pub const MODBUS_GATEWAY: &[KeyDoc] = &[
     need("tcp.filter[].start", Ip, "First address of the rule."),
     need("tcp.filter[].end", Ip, "Last address of the rule."),
     with("tcp.filter[].allow", Bool, "true", "Whether the rule admits or refuses."),
-    with("tcp.idle_timeout", Duration, "\"60s\"", "A connection without a request for so long is closed; \"0s\" = never."),
+    with(
+        "tcp.idle_timeout",
+        Duration,
+        "\"60s\"",
+        "A connection without a request for so long is closed; \"0s\" = never.",
+    ),
     with(
         "tcp.when_full",
         Choice(&["refuse", "close_oldest_idle"]),
@@ -149,7 +183,12 @@ pub const MODBUS_GATEWAY: &[KeyDoc] = &[
     with("port", Tables, "[]", "More lines."),
     need("port[].serial", Service("serial"), "The serial service."),
     with("port[].mode", Choice(&["rtu", "ascii"]), "\"rtu\"", "How frames look on the line."),
-    may("port[].response_timeout", Duration, "that of the gateway", "How long answers on this line are waited for."),
+    may(
+        "port[].response_timeout",
+        Duration,
+        "that of the gateway",
+        "How long answers on this line are waited for.",
+    ),
     with("units", Tables, "[]", "Units whose id differs, or that are on another line than `serial`."),
     need("units[].tcp", Int(0, 255), "Unit id that masters use."),
     may("units[].line", Int(0, 247), "the same", "Address on the line."),
@@ -161,9 +200,19 @@ pub const MODBUS_GATEWAY: &[KeyDoc] = &[
         "\"1s\"",
         "How long a unit is waited for, from the end of the request; then the master gets exception 0B.",
     ),
-    with("retries", Int(0, 255), "0", "Repetitions of a request without an answer; masters repeat by themselves."),
+    with(
+        "retries",
+        Int(0, 255),
+        "0",
+        "Repetitions of a request without an answer; masters repeat by themselves.",
+    ),
     with("turnaround", Duration, "\"200ms\"", "Pause after a broadcast."),
-    with("queue", Int(1, 64), "32", "Requests of all masters that may wait for a line; beyond it exception 06."),
+    with(
+        "queue",
+        Int(1, 64),
+        "32",
+        "Requests of all masters that may wait for a line; beyond it exception 06.",
+    ),
     with("max_wait", Duration, "\"5s\"", "A request that waited for longer gets exception 06."),
     with(
         "broadcast",

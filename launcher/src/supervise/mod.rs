@@ -22,6 +22,7 @@ pub mod debris;
 pub mod ground;
 pub mod hardware;
 pub mod inject;
+pub mod jobs;
 pub mod logbook;
 pub mod notify;
 pub mod outbox;

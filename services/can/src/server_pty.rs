@@ -22,6 +22,13 @@ use crate::{sys, watch};
 /// What a client that has closed the terminal left behind is used for so long.
 const LAST_WORDS: Duration = Duration::from_millis(50);
 
+/// Openings less closings since the last look: at its end, and at its lowest in between.
+#[derive(Debug, Clone, Copy)]
+struct Change {
+    sum: i32,
+    low: i32,
+}
+
 /// A pseudo-terminal with its link.
 pub struct Pty {
     port: Port,
@@ -78,7 +85,7 @@ impl Pty {
         let mut open = 0i32;
         loop {
             while open <= 0 {
-                open += self.events().await?;
+                open += self.events().await?.sum;
             }
             let Some(number) = hub.enter(&peer, Dialect::Slcan) else {
                 tokio::time::sleep(Duration::from_millis(100)).await;
@@ -90,33 +97,46 @@ impl Pty {
                 broken = hub.converse(&self.port, number) => end = broken,
                 events = self.closed(&mut open) => { events?; gone = true; }
             }
-            if gone {
-                let _ = tokio::time::timeout(LAST_WORDS, hub.converse(&self.port, number)).await;
+            // The next one may be there already: nothing of the last one's is for it.
+            hub.look(|bus, _| bus.mute(number));
+            self.discard();
+            if gone && open <= 0 {
+                tokio::select! {
+                    biased;
+                    events = self.events() => open += events?.sum,
+                    _ = tokio::time::timeout(LAST_WORDS, hub.converse(&self.port, number)) => {}
+                }
             }
             hub.leave(&peer, number, Dialect::Slcan, end);
-            self.discard();
         }
     }
 
+    /// Until the last of those who had it open has closed it, even when somebody opened it again since.
     async fn closed(&self, open: &mut i32) -> io::Result<()> {
-        while *open > 0 {
-            *open += self.events().await?;
+        loop {
+            let change = self.events().await?;
+            let before = *open;
+            *open += change.sum;
+            if before + change.low <= 0 {
+                return Ok(());
+            }
         }
-        Ok(())
     }
 
-    /// Waits for openings (+1) and closings (-1) and returns their sum.
-    async fn events(&self) -> io::Result<i32> {
+    /// Waits for openings (+1) and closings (-1).
+    async fn events(&self) -> io::Result<Change> {
         loop {
             let mut guard = self.watch.readable().await?;
             let mut buffer = [std::mem::MaybeUninit::uninit(); 4096];
             let mut reader = inotify::Reader::new(self.watch.get_ref(), &mut buffer);
-            let mut sum = None;
+            let mut change = None;
             loop {
                 match reader.next() {
                     Ok(event) => {
-                        let change = if event.events().contains(inotify::ReadFlags::OPEN) { 1 } else { -1 };
-                        *sum.get_or_insert(0) += change;
+                        let step = if event.events().contains(inotify::ReadFlags::OPEN) { 1 } else { -1 };
+                        let Change { sum, low } = change.get_or_insert(Change { sum: 0, low: 0 });
+                        *sum += step;
+                        *low = (*low).min(*sum);
                     }
                     Err(rustix::io::Errno::AGAIN) => break,
                     Err(rustix::io::Errno::INTR) => {}
@@ -124,8 +144,8 @@ impl Pty {
                 }
             }
             guard.clear_ready();
-            if let Some(sum) = sum {
-                return Ok(sum);
+            if let Some(change) = change {
+                return Ok(change);
             }
         }
     }

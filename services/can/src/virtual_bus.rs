@@ -126,6 +126,8 @@ struct Client {
     out: VecDeque<u8>,
     /// Bytes of `out` that may be written before the hold ends.
     hold: Option<(usize, u64)>,
+    /// Gone, but not all it sent is used yet: nothing is written for it any more.
+    muted: bool,
     counters: ClientCounters,
 }
 
@@ -229,6 +231,7 @@ impl VirtualBus {
             waiting: VecDeque::with_capacity(CLIENT_QUEUE),
             out: VecDeque::with_capacity(limit),
             hold: None,
+            muted: false,
             counters: ClientCounters::default(),
         };
         let first: &[u8] = match dialect {
@@ -243,6 +246,15 @@ impl VirtualBus {
         self.clients[number] = Some(client);
         self.connected += 1;
         Some(number)
+    }
+
+    /// A client reads nothing any more; what it sent may still come.
+    pub fn mute(&mut self, number: usize) {
+        if let Some(client) = self.clients.get_mut(number).and_then(Option::as_mut) {
+            client.muted = true;
+            client.out.clear();
+            client.hold = None;
+        }
     }
 
     /// A client is gone; its waiting frames go with it.
@@ -429,7 +441,7 @@ impl VirtualBus {
         let mut texts = Texts::default();
         for (number, client) in self.clients.iter_mut().enumerate() {
             let Some(client) = client else { continue };
-            if origin == Origin::Client(number) {
+            if origin == Origin::Client(number) || client.muted {
                 continue;
             }
             let text = match &client.talk {
@@ -575,7 +587,7 @@ impl Client {
 
     /// False: dropped, because the client reads nothing. It cannot wait for what it does not read.
     fn reply(&mut self, text: &[u8], settings: &Settings) -> bool {
-        let fits = self.out.len() + text.len() + REPLY_RESERVE <= settings.client_buffer;
+        let fits = !self.muted && self.out.len() + text.len() + REPLY_RESERVE <= settings.client_buffer;
         if fits {
             self.out.extend(text);
         }

@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
+use ipc_types::Finding;
 use ipc_types::stack::{ServiceEntry, Stack};
 use ipc_types::units::Span;
-use ipc_types::Finding;
 use serde::{Deserialize, Serialize};
 
 use crate::driver::Settings;
@@ -271,9 +271,7 @@ impl Config {
         let paced = self.pace && kind == Kind::Pty;
         let silence_ns = self.silence.map_or(timing.t35_ns, Span::ns);
         let mode = match self.framing {
-            Framing::Rtu => {
-                Mode::Rtu { strict_t15: self.strict_t15, grace_ns: self.grace_ns(kind, timing) }
-            }
+            Framing::Rtu => Mode::Rtu { strict_t15: self.strict_t15, grace_ns: self.grace_ns(kind, timing) },
             Framing::Ascii => Mode::Ascii,
             Framing::Delimiter => Mode::delimiter(self.delimiter.as_deref().unwrap_or("\n").as_bytes())
                 .unwrap_or(Mode::Delimiter { pattern: 10, len: 1 }),
@@ -471,9 +469,11 @@ impl Config {
                 found.push(Finding::error(service, key, message, "use at most 60s"));
             }
         }
-        for (key, span) in
-            [("timeout", Some(self.timeout)), ("tx_timeout", Some(self.tx_timeout)), ("silence", self.silence)]
-        {
+        for (key, span) in [
+            ("timeout", Some(self.timeout)),
+            ("tx_timeout", Some(self.tx_timeout)),
+            ("silence", self.silence),
+        ] {
             if span == Some(Span(0)) {
                 let help = "use e.g. \"1s\"; the default of silence is 3.5 characters";
                 found.push(Finding::error(service, key, format!("{key} must be above 0"), help));
@@ -486,12 +486,7 @@ impl Config {
             {
                 if !whole_ms(span) {
                     let message = format!("{key} {span}: the kernel takes whole ms up to 100");
-                    found.push(Finding::error(
-                        service,
-                        key,
-                        message,
-                        "use e.g. \"1ms\", or rs485 = \"rts\"",
-                    ));
+                    found.push(Finding::error(service, key, message, "use e.g. \"1ms\", or rs485 = \"rts\""));
                 }
             }
         }
@@ -503,9 +498,7 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
     let mut found = config.findings(&me.name, &stack.dir);
     let own = |device: &str| {
         Target::parse(device, &stack.dir).map(|t| match t {
-            Target::Device(path) => {
-                std::fs::canonicalize(&path).unwrap_or(path).display().to_string()
-            }
+            Target::Device(path) => std::fs::canonicalize(&path).unwrap_or(path).display().to_string(),
             other => other.to_string(),
         })
     };

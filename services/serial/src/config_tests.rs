@@ -23,7 +23,10 @@ fn defaults_by_framing_and_preset() {
     assert_eq!(shown(json!({})), "19200 8E1");
     assert_eq!(shown(json!({ "framing": "ascii" })), "19200 7E1");
     assert_eq!(shown(json!({ "preset": "device-L" })), "9600 8E1");
-    assert_eq!(shown(json!({ "preset": "device-L", "baud": 1200, "parity": "none", "stop_bits": 2 })), "1200 8N2");
+    assert_eq!(
+        shown(json!({ "preset": "device-L", "baud": 1200, "parity": "none", "stop_bits": 2 })),
+        "1200 8N2"
+    );
     assert_eq!(config(json!({})), Config { device: "pty:com1".into(), ..Config::of_device("x") });
 }
 
@@ -62,7 +65,9 @@ fn mistakes() {
         said(json!({ "flow": "xonxoff", "length": 4, "delimiter": "", "grace": "2min", "silence": "0" })),
         said(json!({ "framing": "length" })),
         said(json!({ "framing": "length", "length": 70000, "strict_t15": true })),
-        said(json!({ "device": "socket://10.0.0.1:4001", "rs485": "kernel", "rts_delay_after": "100us", "pace": true })),
+        said(
+            json!({ "device": "socket://10.0.0.1:4001", "rs485": "kernel", "rts_delay_after": "100us", "pace": true }),
+        ),
         said(json!({ "rs485": "rts", "flow": "rtscts", "max_frame": 0, "timeout": "0" })),
     ];
     insta::assert_snapshot!(all.join("\n"), @r#"

@@ -282,13 +282,7 @@ pub fn echo_flags(head: &Head, len: usize) -> u32 {
     serial_flag::TX_ECHO | if goes_on { 0 } else { serial_flag::END }
 }
 
-fn received(
-    framer: &mut Framer,
-    echo: Option<&mut Echo>,
-    bytes: &[u8],
-    t_ns: u64,
-    sink: &mut dyn Sink,
-) {
+fn received(framer: &mut Framer, echo: Option<&mut Echo>, bytes: &[u8], t_ns: u64, sink: &mut dyn Sink) {
     let own = echo.map_or(0, |echo| echo.filter(bytes, t_ns));
     framer.push(t_ns, &bytes[own..], &mut |chunk| hand_over(sink, &chunk));
 }

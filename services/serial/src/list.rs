@@ -174,7 +174,9 @@ pub fn ports() -> Vec<PortInfo> {
     let Ok(entries) = fs::read_dir("/sys/class/tty") else { return Vec::new() };
     let mut names: Vec<String> =
         entries.flatten().map(|e| e.file_name().to_string_lossy().into_owned()).collect();
-    names.sort_by_key(|name| (name.trim_end_matches(|c: char| c.is_ascii_digit()).to_owned(), name.len(), name.clone()));
+    names.sort_by_key(|name| {
+        (name.trim_end_matches(|c: char| c.is_ascii_digit()).to_owned(), name.len(), name.clone())
+    });
     names.iter().filter(|name| is_port(name)).map(|name| describe(&Path::new("/dev").join(name))).collect()
 }
 

@@ -218,8 +218,9 @@ impl Port {
             Target::Device(path) => device(path, options),
             Target::Terminal(path) => terminal(path, &options.character)
                 .map_err(|source| PortError::Terminal { path: path.display().to_string(), source }),
-            Target::Socket(address) => socket(address)
-                .map_err(|source| PortError::Connect { address: address.clone(), source }),
+            Target::Socket(address) => {
+                socket(address).map_err(|source| PortError::Connect { address: address.clone(), source })
+            }
         }
     }
 
@@ -453,16 +454,12 @@ fn device(path: &Path, options: &Options) -> Result<Port, PortError> {
 /// RS-485, RTS, latency, counters of a real port.
 fn prepare(port: &mut Port, shown: &str, options: &Options) -> Result<(), PortError> {
     match options.rs485 {
-        Some(rs485) => sys::set_rs485(port.fd(), Some(rs485)).map_err(|source| {
-            match source.raw_os_error() {
+        Some(rs485) => {
+            sys::set_rs485(port.fd(), Some(rs485)).map_err(|source| match source.raw_os_error() {
                 Some(libc::ENOTTY | libc::EINVAL) => PortError::NoRs485(shown.to_owned()),
-                _ => PortError::System {
-                    path: shown.to_owned(),
-                    what: "switching on RS-485",
-                    source,
-                },
-            }
-        })?,
+                _ => PortError::System { path: shown.to_owned(), what: "switching on RS-485", source },
+            })?
+        }
         // What an earlier program left on would switch a second time.
         None if sys::rs485_enabled(port.fd()).unwrap_or(false) => {
             let _ = sys::set_rs485(port.fd(), None);

@@ -410,8 +410,10 @@ impl Service {
                 let message = format!("port {} is open, {}", self.config.device, self.options.character);
                 let driver = Driver::new(port, &self.config.settings(kind));
                 let visitors = driver.port().visitors();
-                let visitors =
-                    visitors.map(|fd| self.reactor.add(fd)).transpose().map_err(system("watching the port"))?;
+                let visitors = visitors
+                    .map(|fd| self.reactor.add(fd))
+                    .transpose()
+                    .map_err(system("watching the port"))?;
                 let mut open = Open { driver, since_ns: now_ns, wake: None, visitors };
                 if visitors.is_some() {
                     open.driver.visited();
@@ -539,12 +541,7 @@ impl Service {
 }
 
 /// Takes the next transmission from the rail; false when there is none.
-fn take(
-    tx: &mut Subscriber<SerialChunk>,
-    driver: &mut Driver,
-    rail: &mut Rail,
-    invalid: &mut u64,
-) -> bool {
+fn take(tx: &mut Subscriber<SerialChunk>, driver: &mut Driver, rail: &mut Rail, invalid: &mut u64) -> bool {
     for _ in 0..LOADS {
         let mut loaded = false;
         let taken = tx.drain(1, |message, bytes| {

@@ -351,7 +351,8 @@ mod tests {
     #[test]
     fn a_terminal_becomes_a_pipe_of_any_rate() {
         let (master, slave) = pty();
-        let c = Character { baud: 12_345, data_bits: 7, parity: Parity::Even, stop_bits: 2, flow: Flow::None };
+        let c =
+            Character { baud: 12_345, data_bits: 7, parity: Parity::Even, stop_bits: 2, flow: Flow::None };
         configure(slave.as_fd(), &c, false).unwrap();
         // A pseudo-terminal has eight bits and no parity, whatever is asked; the rate it keeps.
         assert_eq!(differences(slave.as_fd(), &c).unwrap(), ["data_bits", "parity"]);

@@ -60,11 +60,10 @@ fn join(stack: Option<&str>) -> anyhow::Result<Context> {
     observe(&stack).map_err(|e| if full(&e) { crowded(&stack.stack) } else { e.into() })
 }
 
-/// Places for tools are counted per stack and per topic.
+/// Places for tools are few, because every one costs shared memory on every topic.
 fn crowded(stack: &str) -> anyhow::Error {
-    let places = ipc_types::topic::SPARE_PORTS;
     anyhow::anyhow!(
-        "stack '{stack}': {places} tools (`can dump`, `top`, ...) look at it already, and there is no place for more: end one and try again"
+        "stack '{stack}': too many tools (`can dump`, `top`, ...) look at it at the same time: end one and try again"
     )
 }
 

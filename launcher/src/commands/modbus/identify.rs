@@ -46,7 +46,8 @@ pub fn scan(line: &mut Master, from: u8, to: u8, json: bool) -> anyhow::Result<(
         eprint!("\r\x1b[K");
     }
     if json {
-        let list: Vec<Value> = found.iter().map(|(unit, how)| json!({ "unit": unit, "answer": how })).collect();
+        let list: Vec<Value> =
+            found.iter().map(|(unit, how)| json!({ "unit": unit, "answer": how })).collect();
         println(&json!({ "asked": count, "found": list }).to_string());
     }
     if found.is_empty() {
@@ -103,7 +104,10 @@ pub fn identify(line: &mut Master, json: bool) -> anyhow::Result<()> {
         return Ok(());
     }
     if objects.is_empty() {
-        println(&format!("device identification (43/14): {}", refused.unwrap_or_else(|| "no objects".to_owned())));
+        println(&format!(
+            "device identification (43/14): {}",
+            refused.unwrap_or_else(|| "no objects".to_owned())
+        ));
     } else {
         let rows: Vec<Vec<String>> = objects
             .iter()

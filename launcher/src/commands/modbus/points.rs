@@ -151,13 +151,19 @@ fn parse(text: &str, form: &PointArgs, count: u16) -> Result<Point, UsageError> 
     }
     if !order.is_for(value_type.registers()) {
         let registers = value_type.registers();
-        return Err(usage(format!("'{text}': order {} is not for values of {registers} registers", order.name())));
+        return Err(usage(format!(
+            "'{text}': order {} is not for values of {registers} registers",
+            order.name()
+        )));
     }
     let point = Point { name, table, at, count, value_type, order };
     let most = if table.is_bits() { 2000 } else { 125 };
     let entries = usize::from(count) * value_type.registers();
     if entries == 0 || entries > most {
-        return Err(usage(format!("'{text}': one request reads 1 to {most} {}, not {entries}", table.name())));
+        return Err(usage(format!(
+            "'{text}': one request reads 1 to {most} {}, not {entries}",
+            table.name()
+        )));
     }
     if usize::from(at) + entries > 65_536 {
         return Err(usage(format!("'{text}': reaches behind address 65535")));
@@ -176,9 +182,9 @@ pub fn parse_writes(texts: &[String], form: &PointArgs) -> Result<Vec<(Point, Ve
 }
 
 fn parse_write(text: &str, form: &PointArgs) -> Result<(Point, Vec<Value>), UsageError> {
-    let (place, values) = text
-        .split_once('=')
-        .ok_or_else(|| usage(format!("'{text}' is no assignment: write ADDRESS=VALUE, for example 40001=5")))?;
+    let (place, values) = text.split_once('=').ok_or_else(|| {
+        usage(format!("'{text}' is no assignment: write ADDRESS=VALUE, for example 40001=5"))
+    })?;
     let mut point = parse(place, form, 1)?;
     if !matches!(point.table, Table::Coils | Table::HoldingRegisters) {
         return Err(usage(format!("'{text}': {} cannot be written", point.table.name())));
@@ -193,7 +199,8 @@ fn parse_write(text: &str, form: &PointArgs) -> Result<(Point, Vec<Value>), Usag
     }
     let mut count = 0;
     for value in values.split(',') {
-        encode(value.trim(), &point, &mut out).ok_or_else(|| usage(format!("'{text}': {value} is no such value")))?;
+        encode(value.trim(), &point, &mut out)
+            .ok_or_else(|| usage(format!("'{text}': {value} is no such value")))?;
         count += 1;
     }
     point.count = count;
@@ -301,7 +308,15 @@ mod tests {
     fn points() {
         let shown = |text: &str| {
             let p = parse(text, &form(), 1).unwrap();
-            format!("{:?} {} {} x{} {:?} {}", p.name, p.table.name(), p.at, p.count, p.value_type, p.order.name())
+            format!(
+                "{:?} {} {} x{} {:?} {}",
+                p.name,
+                p.table.name(),
+                p.at,
+                p.count,
+                p.value_type,
+                p.order.name()
+            )
         };
         assert_eq!(shown("40001"), "None holding_registers 0 x1 Uint(1) ABCD");
         assert_eq!(shown("0"), "None holding_registers 0 x1 Uint(1) ABCD");
@@ -311,10 +326,21 @@ mod tests {
         assert_eq!(shown("465536"), "None holding_registers 65535 x1 Uint(1) ABCD");
         let zero_based = PointArgs { table: Some(Table::InputRegisters), ..form() };
         assert_eq!(parse("40001", &zero_based, 2).unwrap().at, 40001);
-        let wrong: Vec<String> = ["x", "20001", "40000", "99999999", "0:float:AB", "00001:float", "0x200", "40001:int16:AB:z", "0x", "65535x2"]
-            .iter()
-            .map(|text| parse(text, &form(), 1).unwrap_err().0)
-            .collect();
+        let wrong: Vec<String> = [
+            "x",
+            "20001",
+            "40000",
+            "99999999",
+            "0:float:AB",
+            "00001:float",
+            "0x200",
+            "40001:int16:AB:z",
+            "0x",
+            "65535x2",
+        ]
+        .iter()
+        .map(|text| parse(text, &form(), 1).unwrap_err().0)
+        .collect();
         insta::assert_snapshot!(wrong.join("\n"), @"");
     }
 

@@ -151,7 +151,8 @@ mod tests {
 
     #[test]
     fn clients_are_a_table() {
-        let list = [json!({ "address": "10.0.0.7", "port": 50123, "connected_s": 12, "idle_s": 0, "requests": 7,
+        let list =
+            [json!({ "address": "10.0.0.7", "port": 50123, "connected_s": 12, "idle_s": 0, "requests": 7,
                             "exceptions": 1, "last_unit": 1, "last_function": 3 })];
         assert_eq!(
             text(&list),

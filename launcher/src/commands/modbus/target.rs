@@ -153,18 +153,20 @@ impl Master {
                 let len = mbap::encode(*transaction, unit, pdu, &mut frame).unwrap_or(0);
                 stream.write_all(&frame[..len]).map_err(io)?;
                 let sent = *transaction;
-                read_stream(stream, timeout, |bytes| loop {
-                    match mbap::scan(bytes) {
-                        Scan::Frame { frame, .. } if frame.transaction == sent && frame.unit == unit => {
-                            return Some(Ok(frame.pdu.to_vec()));
-                        }
-                        // A late answer to an earlier request.
-                        Scan::Frame { used, .. } | Scan::Foreign { used } => {
-                            bytes.drain(..used);
-                        }
-                        Scan::Incomplete => return None,
-                        Scan::BadLength { length } => {
-                            return Some(Err(format!("the answer has an impossible length, {length}")));
+                read_stream(stream, timeout, |bytes| {
+                    loop {
+                        match mbap::scan(bytes) {
+                            Scan::Frame { frame, .. } if frame.transaction == sent && frame.unit == unit => {
+                                return Some(Ok(frame.pdu.to_vec()));
+                            }
+                            // A late answer to an earlier request.
+                            Scan::Frame { used, .. } | Scan::Foreign { used } => {
+                                bytes.drain(..used);
+                            }
+                            Scan::Incomplete => return None,
+                            Scan::BadLength { length } => {
+                                return Some(Err(format!("the answer has an impossible length, {length}")));
+                            }
                         }
                     }
                 })
@@ -235,7 +237,8 @@ fn serial(text: &str, ascii: bool) -> anyhow::Result<Wire> {
     config.framing = if ascii { Framing::Ascii } else { Framing::Rtu };
     for pair in query.split('&').filter(|pair| !pair.is_empty()) {
         let (key, value) = pair.split_once('=').unwrap_or((pair, ""));
-        let wrong = || UsageError(format!("'{pair}': write baud=9600, parity=none|even|odd, stop=1|2, data=7|8"));
+        let wrong =
+            || UsageError(format!("'{pair}': write baud=9600, parity=none|even|odd, stop=1|2, data=7|8"));
         match key {
             "baud" => config.baud = Some(value.parse().map_err(|_| wrong())?),
             "parity" => {
@@ -282,8 +285,7 @@ fn through_service(
     job: &Value,
 ) -> Result<Value, Failed> {
     let other = |e: &dyn std::fmt::Display| Failed::Other(e.to_string());
-    let header =
-        Job { deadline_t_ns: clock::mono_ns() + SERVICE_LIMIT.as_nanos() as u64, ..Job::default() };
+    let header = Job { deadline_t_ns: clock::mono_ns() + SERVICE_LIMIT.as_nanos() as u64, ..Job::default() };
     let text = serde_json::to_vec(job).map_err(|e| other(&e))?;
     let seq = jobs.send_tail(header, &text).map_err(|e| other(&e))?;
     jobs.ring();
@@ -299,7 +301,9 @@ fn through_service(
             Some((0, body)) => return Ok(body.get("ok").cloned().unwrap_or(body)),
             Some((_, body)) => {
                 let text = body.get("error").and_then(Value::as_str).unwrap_or("it failed").to_owned();
-                let code = text.strip_prefix("exception ").and_then(|rest| u8::from_str_radix(rest.get(..2)?, 16).ok());
+                let code = text
+                    .strip_prefix("exception ")
+                    .and_then(|rest| u8::from_str_radix(rest.get(..2)?, 16).ok());
                 return Err(match code {
                     Some(code) => Failed::Exception(code, text),
                     None if text.starts_with("no answer") => Failed::NoAnswer(text),

@@ -181,7 +181,7 @@ fn own_frames_outside_of_the_filters_need_no_echo() {
         }
         assert!(matches!(wire.exchange(), End::No));
         let mut bytes = [0; 80];
-        let sent: Vec<_> = std::iter::from_fn(|| far.recv(&mut bytes).ok()).map(|n| n).collect();
+        let sent: Vec<_> = std::iter::from_fn(|| far.recv(&mut bytes).ok()).collect();
         assert_eq!(sent, [16, 16, 16]);
         let seen: Vec<_> = ears.frames.borrow().iter().map(|(text, _)| text.clone()).collect();
         assert_eq!(seen, ["210#01", "211#03"], "123 waits for its echo");

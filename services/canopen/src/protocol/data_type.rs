@@ -46,6 +46,7 @@ pub enum DataType {
     Other(u16),
 }
 
+#[allow(clippy::enum_glob_use)] // thirty names of the standard that mean nothing else here
 use DataType::*;
 
 /// Type, index, name, bits (0 = not fixed).

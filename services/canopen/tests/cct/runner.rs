@@ -13,7 +13,7 @@ use crate::{eds, own};
 use serde::Deserialize;
 
 /// How long an answer of the device may be away.
-const LIMIT_MS: u64 = 12_000;
+const LIMIT_MS: u64 = 30_000;
 const HEARTBEAT_MS: u64 = 900;
 
 #[derive(Debug, Deserialize)]
@@ -89,6 +89,8 @@ struct Run<'a> {
     sync_ns: u64,
     /// A reset or stop was sent last: SYNCs of before may still arrive.
     in_flight: bool,
+    /// Step that was sent before its turn.
+    sent_early: Option<usize>,
     /// TPDOs 1 and 2 that the log has, where a case counts them.
     counted: [usize; 2],
 }
@@ -132,6 +134,7 @@ impl<'a> Run<'a> {
             object: 0,
             sync_ns: 0,
             in_flight: false,
+            sent_early: None,
             counted: [0; 2],
         }
     }
@@ -146,12 +149,17 @@ impl<'a> Run<'a> {
                 }
                 // The tool's own markers.
                 _ if step[1] == "7FF" => Ok(()),
+                "Tx" if self.sent_early == Some(at) => {
+                    self.sent_early = None;
+                    Ok(())
+                }
                 "Tx" => {
                     self.tx(u32::from_str_radix(&step[1], 16).unwrap(), &bytes(&step[2]));
                     Ok(())
                 }
                 _ => {
                     let id = u32::from_str_radix(&step[1], 16).unwrap();
+                    self.beat_while_waiting(case, at, id, &bytes(&step[2]));
                     self.rx(case, id, &bytes(&step[2]))
                 }
             };
@@ -177,6 +185,33 @@ impl<'a> Run<'a> {
             }
         }
         Ok(())
+    }
+    /// The log is about to wait for a frame. If a heartbeat of another node comes later in it, that node goes on with its
+    /// period meanwhile.
+    fn beat_while_waiting(&mut self, case: &Case, at: usize, id: u32, data: &[u8]) {
+        if self.device.sent.iter().any(|sent| sent.id == id && sent.data == data) || self.sent_early.is_some() {
+            return;
+        }
+        let Some(beat) = self.beat_ns else { return };
+        let rest = || case.steps.iter().enumerate().skip(at);
+        let other = |step: &Vec<String>| {
+            step[0] == "Tx" && step[1].starts_with('7') && step[1] != "704" && step[1] != "7FF"
+        };
+        // Not behind a loss, and not behind other commands of the tool.
+        let stop = |step: &Vec<String>| {
+            (step[0] == "Tx" && !other(step)) || (step[1] == "084" && step[2].starts_with("3081"))
+        };
+        let next = rest().take_while(|(_, step)| !stop(step)).find(|(_, step)| other(step));
+        if let Some((next, step)) = next {
+            let due = beat + HEARTBEAT_MS * MS;
+            while self.device.t_ns < due && !self.device.sent.iter().any(|sent| sent.id == id && sent.data == data) {
+                self.device.wait_ms(1);
+            }
+            if self.device.t_ns >= due {
+                self.tx(u32::from_str_radix(&step[1], 16).unwrap(), &bytes(&step[2]));
+                self.sent_early = Some(next);
+            }
+        }
     }
     fn note(&mut self, note: &str) {
         if let Some(codes) = codes(note) {

@@ -27,14 +27,7 @@ fn settings(mode: Mode) -> Settings {
         Mode::Ascii => MAX_ASCII,
         _ => 3000,
     };
-    Settings {
-        mode,
-        timing,
-        silence_ns: timing.t35_ns,
-        timeout_ns: 1000 * MS,
-        max_frame,
-        timed: true,
-    }
+    Settings { mode, timing, silence_ns: timing.t35_ns, timeout_ns: 1000 * MS, max_frame, timed: true }
 }
 
 impl Line {
@@ -183,7 +176,8 @@ fn noise_without_end_is_cut_and_silence_heals() {
 
 #[test]
 fn a_backlog_longer_than_the_buffer_keeps_its_frames() {
-    let mut line = Line::new(Settings { timed: false, ..settings(Mode::Rtu { strict_t15: false, grace_ns: 0 }) });
+    let mut line =
+        Line::new(Settings { timed: false, ..settings(Mode::Rtu { strict_t15: false, grace_ns: 0 }) });
     let answer = frame(&[&[1u8, 3, 100][..], &[5; 100]].concat());
     let all: Vec<u8> = std::iter::repeat_n(answer.clone(), 30).flatten().collect();
     line.push(100 * MS, &all);

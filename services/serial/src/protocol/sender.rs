@@ -229,8 +229,7 @@ impl Sender {
             });
             own.max(heard)
         };
-        let busy =
-            receiving && s.half_duplex && !self.goes_on && self.head.flags & serial_flag::AT_ONCE == 0;
+        let busy = receiving && s.half_duplex && !self.goes_on && self.head.flags & serial_flag::AT_ONCE == 0;
         if !busy && now_ns >= free_ns {
             if s.rts.is_some() {
                 self.state = State::RtsOn;
@@ -249,8 +248,7 @@ impl Sender {
     }
 
     fn begin(&mut self, now_ns: u64) {
-        self.state =
-            State::Writing { started_ns: now_ns, written: 0, progress_ns: now_ns, retry_ns: now_ns };
+        self.state = State::Writing { started_ns: now_ns, written: 0, progress_ns: now_ns, retry_ns: now_ns };
     }
 
     fn write(&mut self, now_ns: u64) -> Step {
@@ -311,8 +309,7 @@ impl Sender {
                 self.state = State::RtsOff { outcome };
             }
         } else if now_ns >= limit_ns {
-            let outcome =
-                Outcome { first_ns: started_ns, end_ns: now_ns, not_sent: Some(NotSent::Blocked) };
+            let outcome = Outcome { first_ns: started_ns, end_ns: now_ns, not_sent: Some(NotSent::Blocked) };
             self.state = State::RtsOff { outcome };
         } else {
             let due_ns = now_ns + self.settings.timing.char_ns.clamp(50_000, 2_000_000);
@@ -323,8 +320,7 @@ impl Sender {
     /// Ends what is under way: the port is gone. The outcome comes with the next [`Self::step`].
     pub fn port_gone(&mut self, now_ns: u64) {
         if !self.is_idle() {
-            let outcome =
-                Outcome { first_ns: now_ns, end_ns: now_ns, not_sent: Some(NotSent::PortGone) };
+            let outcome = Outcome { first_ns: now_ns, end_ns: now_ns, not_sent: Some(NotSent::PortGone) };
             self.state = State::RtsOff { outcome };
         }
     }
@@ -351,9 +347,8 @@ impl Sender {
             Some(NotSent::PortGone) => self.counters.port_gone += 1,
         }
         // Only a full chunk can be a part of a longer frame.
-        self.goes_on = outcome.not_sent.is_none()
-            && self.len == CHUNK_BYTES
-            && self.head.flags & serial_flag::END == 0;
+        self.goes_on =
+            outcome.not_sent.is_none() && self.len == CHUNK_BYTES && self.head.flags & serial_flag::END == 0;
         self.state = State::Idle;
         Step::Done(outcome)
     }

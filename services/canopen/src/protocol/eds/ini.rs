@@ -189,7 +189,7 @@ pub fn decode(bytes: &[u8], diags: &mut Vec<Diag>) -> String {
     match std::str::from_utf8(bytes) {
         Ok(text) => text.to_owned(),
         Err(error) => {
-            let line = 1 + bytes[..error.valid_up_to()].iter().filter(|&&byte| byte == b'\n').count();
+            let line = bytes[..error.valid_up_to()].split(|&byte| byte == b'\n').count();
             let text = "the file is not UTF-8: read as Latin-1".to_owned();
             diags.push(Diag::warning(u32::try_from(line).unwrap_or(u32::MAX), "", "", text));
             bytes.iter().map(|&byte| char::from(byte)).collect()

@@ -6,6 +6,7 @@ use super::{Commissioning, DeviceInfo, Diag, Eds, EdsEntry, EdsError, EdsObject,
 use crate::protocol::data_type::{DataType, Number};
 use crate::protocol::od::{self, Access, ObjectCode};
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 
 /// Most mapping entries of a PDO that the file leaves out, for a granularity of bytes and of bits.
 const MAPPING_BYTES: u8 = 8;
@@ -439,10 +440,10 @@ impl Parser<'_> {
         let last = object.subs.keys().next_back().copied().unwrap_or(0);
         let (line, count, compact) = (object.line, object.subs.len(), object.compact);
         let named = format!("{index:04X}");
-        if !object.subs.contains_key(&0) {
+        if let Entry::Vacant(zero) = object.subs.entry(0) {
             let mut highest = made("Highest sub-index supported", DataType::Unsigned8, Access::Const);
             highest.default = Some(Value { bytes: vec![last], node_relative: false });
-            object.subs.insert(0, highest);
+            zero.insert(highest);
             self.entries += 1;
             let text = format!("sub-index 00 is missing: made with the value {last}");
             self.diags.push(Diag::warning(line, &named, "", text));

@@ -187,7 +187,10 @@ fn hex(text: &str) -> Option<Vec<u8>> {
     let text = text.strip_prefix("0x").or_else(|| text.strip_prefix("0X")).unwrap_or(text);
     let digits: Vec<u32> =
         text.chars().filter(|c| !c.is_whitespace()).map(|c| c.to_digit(16)).collect::<Option<_>>()?;
-    (digits.len() % 2 == 0).then(|| digits.chunks(2).map(|pair| (pair[0] * 16 + pair[1]) as u8).collect())
+    digits
+        .len()
+        .is_multiple_of(2)
+        .then(|| digits.chunks(2).map(|pair| (pair[0] * 16 + pair[1]) as u8).collect())
 }
 
 /// A value as a DCF has it: integers and booleans decimal or hexadecimal, reals decimal, strings as text, the rest
@@ -212,12 +215,20 @@ pub fn format(data_type: DataType, bytes: &[u8]) -> Option<String> {
                 }
                 Some(Number::Int(value)) => value.to_string(),
                 None if data_type.size().is_some() => return None,
-                None => bytes.iter().map(|byte| format!("{byte:02X}")).collect(),
+                None => hex_digits(bytes),
             });
         }
     };
     let whole = text == text.trim() && !text.contains(['\n', '\r', '\0']);
     whole.then_some(text)
+}
+
+fn hex_digits(bytes: &[u8]) -> String {
+    use std::fmt::Write;
+    bytes.iter().fold(String::with_capacity(2 * bytes.len()), |mut text, byte| {
+        let _ = write!(text, "{byte:02X}");
+        text
+    })
 }
 
 /// Text that says why a write of `bytes` to `entry` is not possible, if so.

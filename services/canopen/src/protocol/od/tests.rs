@@ -2,6 +2,7 @@ use super::*;
 use proptest::prelude::*;
 
 fn sample() -> ObjectDictionary {
+    #[allow(clippy::enum_glob_use)]
     use DataType::*;
     let mut b = OdBuilder::new();
     b.var(0x1000, EntryDef::new(Unsigned32, Access::Ro).value(0x000F_0191))
@@ -30,7 +31,8 @@ fn sample() -> ObjectDictionary {
 #[test]
 fn every_check_has_its_abort_code() {
     let mut od = sample();
-    let table: &[(u16, u8, &[u8], Result<(), Abort>)] = &[
+    type Row<'a> = (u16, u8, &'a [u8], Result<(), Abort>);
+    let table: &[Row] = &[
         (0x1004, 0, &[0], Err(Abort::NO_OBJECT)),
         (0x1000, 1, &[0], Err(Abort::NO_SUB_INDEX)),
         (0x2000, 5, &[0], Err(Abort::NO_SUB_INDEX)),
@@ -131,6 +133,7 @@ fn handles_and_iteration() {
 
 #[test]
 fn faults_of_the_builder() {
+    #[allow(clippy::enum_glob_use)]
     use DataType::*;
     let var = |data_type| EntryDef::new(data_type, Access::Rw);
     let build = |f: &dyn Fn(&mut OdBuilder)| {

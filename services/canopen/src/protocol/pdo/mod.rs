@@ -111,6 +111,3 @@ impl Communication {
         }
     }
 }
-
-#[cfg(test)]
-mod tests;

@@ -356,8 +356,8 @@ impl SdoServer {
         hooks: &mut dyn Hooks,
     ) -> Result<(), Abort> {
         match size {
-            Some(size) if self.buffer.len() > size => return Err(Abort::TOO_LONG),
-            Some(size) if self.buffer.len() < size => return Err(Abort::TOO_SHORT),
+            Some(size) if self.buffer.len() > size => Err(Abort::TOO_LONG),
+            Some(size) if self.buffer.len() < size => Err(Abort::TOO_SHORT),
             _ => od.write_hooked(hooks, self.mux.index, self.mux.sub, &self.buffer),
         }
     }

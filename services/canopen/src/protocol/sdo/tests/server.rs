@@ -2,6 +2,7 @@
 
 use super::super::*;
 use crate::protocol::abort::Abort;
+#[allow(clippy::enum_glob_use)]
 use crate::protocol::data_type::DataType::*;
 use crate::protocol::data_type::Number;
 use crate::protocol::io::Outbox;
@@ -79,7 +80,7 @@ fn words(out: &Outbox) -> Vec<String> {
         .iter()
         .map(|frame| {
             assert_eq!((frame.can_id, frame.len), (0x584, 8));
-            frame.data[..8].iter().map(|byte| format!("{byte:02X}")).collect()
+            format!("{:016X}", u64::from_be_bytes(frame.data[..8].try_into().unwrap()))
         })
         .collect()
 }
