@@ -127,7 +127,7 @@ fn seven_bits_on_a_terminal_a_port_that_is_taken_and_dump() {
     let pid = second.pid("com1");
     third.wait("the sentence that the port is in use", || {
         let log = third.log();
-        (log.contains(&format!("is in use by dr:com1 (pid {pid})"))).then_some(())
+        log.contains(&format!("is in use by dr:com1 (pid {pid})")).then_some(())
     });
     drop(third);
 

@@ -9,6 +9,7 @@ import sys
 from pymodbus.datastore import ModbusDeviceContext, ModbusSequentialDataBlock, ModbusServerContext
 from pymodbus.framer import FramerType
 from pymodbus.server import ModbusSerialServer, ModbusTcpServer
+from pymodbus.server.requesthandler import ServerRequestHandler as ModbusServerRequestHandler
 
 
 def device(unit):
@@ -27,6 +28,14 @@ async def main():
     if kind == "tcp":
         server = ModbusTcpServer(context, address=("127.0.0.1", int(where)))
     else:
+        # On a line with other units, those that are not ours stay silent; pymodbus would answer exception 04.
+        handle = ModbusServerRequestHandler.handle_request
+
+        async def ours_only(handler):
+            if handler.last_pdu and handler.last_pdu.dev_id in [0, *units]:
+                await handle(handler)
+
+        ModbusServerRequestHandler.handle_request = ours_only
         framer = FramerType.ASCII if kind == "ascii" else FramerType.RTU
         server = ModbusSerialServer(context, framer=framer, port=where, baudrate=19200, ignore_missing_devices=True)
     task = asyncio.create_task(server.serve_forever())

@@ -2,24 +2,14 @@
 
 use super::{UsageError, println};
 use crate::cli::PlcCommand;
-use crate::supervise::client::{Client, find, observe};
-use crate::supervise::control::{Reply, Request, ServiceRow};
-use crate::supervise::state_dir::RunningStack;
-use ipc_types::payload::{Health, Job, JobResult};
-use ipc_types::port::{Publisher, SendError, Subscriber};
-use ipc_types::topic::TopicKind;
-use ipc_types::{Context, clock};
+use crate::supervise::client::{find, observe};
+use crate::supervise::jobs::{JobLine, choose};
 use serde_json::{Value, json};
 use std::path::Path;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// How long a job may take.
 const LIMIT: Duration = Duration::from_secs(5);
-const LOOK: Duration = Duration::from_millis(1);
-/// The launcher answers at once; it waits for nothing.
-const LAUNCHER_LIMIT: Duration = Duration::from_secs(2);
-/// So often the launcher is asked whether the plc is still to come back.
-const ASK_LAUNCHER: Duration = Duration::from_millis(250);
 
 pub fn run(
     service: Option<&str>,
@@ -33,10 +23,10 @@ pub fn run(
     for job in &mut jobs {
         name_as_stack_does(job, &ctx.stack.dir);
     }
-    let plc = choose(&ctx, service)?;
-    let mut line = Line::open(&mut ctx, running, &plc)?;
+    let plc = choose(&ctx, "plc", service)?;
+    let mut line = JobLine::open(&mut ctx, running, "plc", &plc)?;
     for job in jobs {
-        let answer = line.ask(&job)?;
+        let answer = line.ask(&job, LIMIT)?;
         if json {
             println(&answer.to_string());
         } else {
@@ -106,164 +96,6 @@ pub fn assignment(text: &str) -> Result<(String, Value), UsageError> {
     Ok((var, parsed))
 }
 
-/// The plc service meant: the one named, or the only one.
-fn choose(ctx: &Context, named: Option<&str>) -> anyhow::Result<String> {
-    let list: Vec<&str> =
-        ctx.stack.services.iter().filter(|s| s.kind == "plc").map(|s| s.name.as_str()).collect();
-    match (named, list.as_slice()) {
-        (_, []) => anyhow::bail!("stack '{}' has no plc service", ctx.stack.name),
-        (Some(name), list) if list.contains(&name) => Ok(name.to_owned()),
-        (Some(name), list) => {
-            anyhow::bail!(
-                "stack '{}' has no plc service '{name}'; it has {}",
-                ctx.stack.name,
-                list.join(", ")
-            )
-        }
-        (None, [only]) => Ok((*only).to_owned()),
-        (None, list) => {
-            anyhow::bail!("several plc services: {}; say which one with --service NAME", list.join(", "))
-        }
-    }
-}
-
-/// When a job is to be sent. Sans-I/O: a plc that dies takes its unread jobs along, so they are sent again to its
-/// successor.
-#[derive(Debug, Default)]
-struct Sending {
-    /// Generation of the plc that got the job.
-    to: Option<u32>,
-}
-
-impl Sending {
-    /// Whether the job must be sent to a plc of this generation.
-    fn is_due(&self, generation: u32) -> bool {
-        self.to.is_none_or(|to| generation > to)
-    }
-
-    fn sent(&mut self, generation: u32) {
-        self.to = Some(generation);
-    }
-}
-
-/// Why no answer can come, from the plc's row of `ps`.
-fn hopeless(row: Option<&ServiceRow>) -> Option<String> {
-    let row = row?;
-    matches!(row.state.as_str(), "held" | "ended" | "stopping").then(|| {
-        let way = if row.state == "held" {
-            format!("; `dinrail logs {0}` says why, `dinrail restart {0}` starts it again", row.service)
-        } else {
-            String::new()
-        };
-        format!("plc '{}' is {}{way}", row.service, row.state)
-    })
-}
-
-/// The way to a plc service and back. One a process: the numbers of its jobs count up.
-struct Line {
-    plc: String,
-    writer: u32,
-    jobs: Publisher<Job>,
-    results: Subscriber<JobResult>,
-    health: Subscriber<Health>,
-    running: RunningStack,
-    /// Newest generation of the plc that is known.
-    generation: u32,
-}
-
-impl Line {
-    fn open(ctx: &mut Context, running: RunningStack, plc: &str) -> anyhow::Result<Self> {
-        // First the ear, then the mouth: the answer may come at once.
-        let results = ctx.subscriber::<JobResult>(&TopicKind::Results.of(plc))?;
-        let health = ctx.subscriber::<Health>(&TopicKind::Health.of(plc))?;
-        let jobs = ctx.publisher::<Job>(&TopicKind::Jobs.of(plc))?;
-        let mut line =
-            Self { plc: plc.to_owned(), writer: ctx.writer, jobs, results, health, running, generation: 0 };
-        line.ask_launcher()?;
-        Ok(line)
-    }
-
-    /// Which generation runs now; an error when none will come.
-    fn ask_launcher(&mut self) -> anyhow::Result<()> {
-        let mut client = Client::connect(self.running.clone())?;
-        let Reply::Ps(rows) = client.call(&Request::Ps {}, LAUNCHER_LIMIT)? else {
-            anyhow::bail!("the launcher gave another answer than asked for; is it of another version?");
-        };
-        let row = rows.iter().find(|row| row.service == self.plc);
-        if let Some(why) = hopeless(row) {
-            anyhow::bail!("{why}");
-        }
-        self.generation = self.generation.max(row.map_or(0, |row| row.generation));
-        Ok(())
-    }
-
-    /// Sends a job and waits for its result. A plc that is restarted meanwhile gets it again.
-    fn ask(&mut self, job: &Value) -> anyhow::Result<Value> {
-        let text = serde_json::to_vec(job)?;
-        let (mut sending, mut sent) = (Sending::default(), Vec::new());
-        let begin = Instant::now();
-        let mut asked_launcher = begin;
-        let mut refused = None;
-        while begin.elapsed() <= LIMIT {
-            let generation = &mut self.generation;
-            self.health.newest(|health, _| *generation = (*generation).max(health.stamp.generation));
-            if sending.is_due(self.generation) {
-                let left = LIMIT.saturating_sub(begin.elapsed());
-                let header =
-                    Job { deadline_t_ns: clock::mono_ns() + left.as_nanos() as u64, ..Job::default() };
-                match self.jobs.send_tail(header, &text) {
-                    Ok(seq) => {
-                        self.jobs.ring();
-                        sending.sent(self.generation);
-                        sent.push(seq);
-                    }
-                    // It starts, or it has much to do: it will read again.
-                    Err(e @ (SendError::NoReader(_) | SendError::Full(_))) => refused = Some(e),
-                    Err(e) => return Err(e.into()),
-                }
-            }
-            if let Some(answer) = self.answer(&sent) {
-                return answer;
-            }
-            if asked_launcher.elapsed() >= ASK_LAUNCHER {
-                asked_launcher = Instant::now();
-                self.ask_launcher()?;
-            }
-            std::thread::sleep(LOOK);
-        }
-        match refused.filter(|_| sent.is_empty()) {
-            Some(refused) => Err(refused.into()),
-            None => anyhow::bail!(
-                "plc '{}' did not answer within {} s; see `dinrail ps`",
-                self.plc,
-                LIMIT.as_secs()
-            ),
-        }
-    }
-
-    /// The result of one of these jobs of ours, if it has come.
-    fn answer(&mut self, sent: &[u64]) -> Option<anyhow::Result<Value>> {
-        let (plc, writer) = (&self.plc, self.writer);
-        let mut answer = None;
-        self.results.drain(64, |result, tail| {
-            if result.job_writer == writer && sent.contains(&result.job_seq) {
-                answer = Some((result.code, serde_json::from_slice::<Value>(tail).unwrap_or(Value::Null)));
-            }
-        });
-        Some(match answer? {
-            (0, body) => Ok(body.get("ok").cloned().unwrap_or(body)),
-            (code, body) => {
-                let error = body.get("error").and_then(Value::as_str).unwrap_or(match code {
-                    2 => "it came too late",
-                    3 => "not supported",
-                    _ => "it failed",
-                });
-                Err(anyhow::anyhow!("plc '{plc}': {error}"))
-            }
-        })
-    }
-}
-
 fn text_of(job: &Value, answer: &Value) -> String {
     let var = job.get("var").and_then(Value::as_str);
     match (var, answer) {
@@ -312,30 +144,6 @@ mod tests {
             let message = assignment(text).unwrap_err().to_string();
             assert!(message.contains("write VAR=VALUE"), "{message}");
         }
-    }
-
-    #[test]
-    fn a_job_goes_once_to_each_generation() {
-        let mut sending = Sending::default();
-        assert!(sending.is_due(1));
-        sending.sent(1);
-        // A heartbeat of a process before it, from the queue of a dead writer.
-        assert!(!sending.is_due(1) && !sending.is_due(0) && sending.is_due(2));
-        sending.sent(2);
-        assert!(!sending.is_due(2));
-    }
-
-    #[test]
-    fn a_plc_that_will_not_come_back_is_told_at_once() {
-        let mut row = super::super::top::tests::row("plc", "plc");
-        assert_eq!(hopeless(Some(&row)), None);
-        row.state = "back-off".into();
-        assert_eq!(hopeless(Some(&row)), None);
-        row.state = "held".into();
-        let why = hopeless(Some(&row)).unwrap();
-        assert!(why.starts_with("plc 'plc' is held; ") && why.contains("`dinrail restart plc`"), "{why}");
-        row.state = "stopping".into();
-        assert_eq!(hopeless(Some(&row)).unwrap(), "plc 'plc' is stopping");
     }
 
     #[test]

@@ -211,4 +211,28 @@ mod tests {
         sending.sent(2);
         assert!(!sending.is_due(2));
     }
+
+    #[test]
+    fn a_plc_that_will_not_come_back_is_told_at_once() {
+        let mut row = ServiceRow {
+            service: "plc".into(),
+            kind: "plc".into(),
+            state: "running".into(),
+            health: "ready".into(),
+            pid: 4242,
+            generation: 1,
+            restarts: 0,
+            uptime_ms: 0,
+            cpu_percent: 0.0,
+            rss_bytes: 0,
+        };
+        assert_eq!(hopeless("plc", Some(&row)), None);
+        row.state = "back-off".into();
+        assert_eq!(hopeless("plc", Some(&row)), None);
+        row.state = "held".into();
+        let why = hopeless("plc", Some(&row)).unwrap();
+        assert!(why.starts_with("plc 'plc' is held; ") && why.contains("`dinrail restart plc`"), "{why}");
+        row.state = "stopping".into();
+        assert_eq!(hopeless("plc", Some(&row)).unwrap(), "plc 'plc' is stopping");
+    }
 }

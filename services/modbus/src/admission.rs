@@ -69,9 +69,10 @@ impl Filter {
     pub fn fault(&self) -> Option<(String, &'static str)> {
         match self {
             Self::One(range) => range.fault().map(|fault| (fault, "exchange start and end, or correct them")),
-            Self::Rules(rules) if rules.len() > MAX_RULES => {
-                Some((format!("filter: {} rules; at most {MAX_RULES} are allowed", rules.len()), "join ranges"))
-            }
+            Self::Rules(rules) if rules.len() > MAX_RULES => Some((
+                format!("filter: {} rules; at most {MAX_RULES} are allowed", rules.len()),
+                "join ranges",
+            )),
             Self::Rules(rules) if !rules.iter().any(|rule| rule.allow) => Some((
                 "filter: no rule admits anybody".to_owned(),
                 "end the list with { start = \"0.0.0.0\", end = \"255.255.255.255\" } to admit the rest",

@@ -61,7 +61,9 @@ pub enum BufferError {
     Address { what: &'static str, entry: usize, source: AddressError },
     #[error("{what} {entry}: {got} is a bit; a buffer begins at a byte or word")]
     Bit { what: &'static str, entry: usize, got: String },
-    #[error("{what} {entry}: it reaches byte {end} of %{area}, which has {size}; make it smaller or raise the size of %{area} in the plc service")]
+    #[error(
+        "{what} {entry}: it reaches byte {end} of %{area}, which has {size}; make it smaller or raise the size of %{area} in the plc service"
+    )]
     PastArea { what: &'static str, entry: usize, end: u64, area: char, size: u32 },
     #[error("file {entry}: number 0 is no file; files are 1 to 65535")]
     Number { entry: usize },
@@ -309,7 +311,9 @@ mod tests {
         buffers.read_file(&memory(&marker), 5, 0, &mut out).unwrap();
         assert_eq!(out, [8, 9, 0, 0]);
         let mut set = WriteSet::default();
-        buffers.plan(&WriteGroup { reference: 6, file: 4, record: 1, values: &[0xAB, 0xCD] }, &mut set).unwrap();
+        buffers
+            .plan(&WriteGroup { reference: 6, file: 4, record: 1, values: &[0xAB, 0xCD] }, &mut set)
+            .unwrap();
         let runs: Vec<_> = set.runs().map(|run| (run.area, run.offset, run.or.to_vec())).collect();
         assert_eq!(runs, [(Area::Marker, 22, vec![0xCD, 0xAB])]);
 

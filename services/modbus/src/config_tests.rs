@@ -73,7 +73,8 @@ fn places_of_bits_and_lists() {
     let place = |json: &str| {
         let config = parse(json);
         let at = Addressing::Element;
-        let error = config.enable_bit(at).err().or(config.exception_bits(at).err()).or(config.client_list(at).err());
+        let error =
+            config.enable_bit(at).err().or(config.exception_bits(at).err()).or(config.client_list(at).err());
         error.unwrap().to_string()
     };
     assert_snapshot!(place(r#"{ "enable_from": "%MW0" }"#), @"enable_from: %MW0 is no bit; write one like %MX0.0");

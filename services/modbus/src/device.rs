@@ -176,7 +176,8 @@ impl Device {
         let own = pdu.first() == Some(&function::DIAGNOSTICS);
         for slot in 0..self.units.len() {
             let map = self.units[slot].map;
-            let done = self.units[..slot].iter().any(|before| before.map == map && !before.line.is_listen_only());
+            let done =
+                self.units[..slot].iter().any(|before| before.map == map && !before.line.is_listen_only());
             let state = &mut self.units[slot];
             state.line.received(true);
             if state.line.is_listen_only() && !is_restart(pdu) {
@@ -211,10 +212,8 @@ impl Device {
             return Served::Silent(None);
         }
         let outcome = self.execute(slot, unit, pdu, peer, image, out);
-        let poll = matches!(
-            outcome.function,
-            function::GET_COMM_EVENT_COUNTER | function::GET_COMM_EVENT_LOG
-        );
+        let poll =
+            matches!(outcome.function, function::GET_COMM_EVENT_COUNTER | function::GET_COMM_EVENT_LOG);
         let answered = outcome.len > 0;
         self.units[slot].line.processed(outcome.exception, poll, answered);
         if answered { Served::Answer(outcome) } else { Served::Silent(Some(outcome)) }

@@ -124,8 +124,7 @@ fn serial_codes_and_rights() {
     let rights = r#"[ { "units": [2], "allow": "read" }, { "functions": [43], "allow": "nothing" } ]"#;
     let rights = Rights::new(&serde_json::from_str::<Vec<RightsEntry>>(rights).unwrap(), &[]).unwrap();
     let identity = IdentityConfig::default().build().unwrap();
-    let shared =
-        Shared { identity: Rc::new(identity), rights: Rc::new(rights), serial_codes_on_tcp: false };
+    let shared = Shared { identity: Rc::new(identity), rights: Rc::new(rights), serial_codes_on_tcp: false };
     let mut tcp = Device::tcp(None, &[], shared.clone());
     for code in ["07", "08 0000 0000", "0B", "0C", "11"] {
         let refused = format!("{:02X}01", hex(code)[0] | 0x80);

@@ -76,7 +76,11 @@ pub struct Identity {
 
 impl Default for Identity {
     fn default() -> Self {
-        IdentityConfig::default().build().unwrap_or(Self { server_id: 0, server_text: vec![], objects: vec![] })
+        IdentityConfig::default().build().unwrap_or(Self {
+            server_id: 0,
+            server_text: vec![],
+            objects: vec![],
+        })
     }
 }
 
@@ -118,7 +122,11 @@ impl IdentityConfig {
             objects.push((id, value.clone().into_bytes()));
         }
         objects.sort_by_key(|(id, _)| *id);
-        Ok(Identity { server_id: self.server_id, server_text: self.server_text.clone().into_bytes(), objects })
+        Ok(Identity {
+            server_id: self.server_id,
+            server_text: self.server_text.clone().into_bytes(),
+            objects,
+        })
     }
 }
 
@@ -197,7 +205,11 @@ mod tests {
         }
     }
 
-    fn read(identity: &Identity, code: u8, object: u8) -> Result<(u8, bool, u8, Vec<(u8, String)>), Exception> {
+    fn read(
+        identity: &Identity,
+        code: u8,
+        object: u8,
+    ) -> Result<(u8, bool, u8, Vec<(u8, String)>), Exception> {
         let mut out = [0; MAX_PDU];
         let len = identity.read(code, object, &mut out)?;
         let request = Request::ReadDeviceIdentification { code, object };
@@ -261,7 +273,8 @@ mod tests {
 
     #[test]
     fn function_17() {
-        let identity = IdentityConfig { server_id: 5, server_text: "abc".into(), ..config() }.build().unwrap();
+        let identity =
+            IdentityConfig { server_id: 5, server_text: "abc".into(), ..config() }.build().unwrap();
         let mut out = [0; MAX_PDU];
         assert_eq!(identity.report(true, &mut out), 7);
         assert_eq!(out[..7], [17, 5, 5, 0xFF, b'a', b'b', b'c']);

@@ -12,15 +12,15 @@
 //! What may never happen here: a panic or an allocation that a client can cause by a request, a write that is
 //! applied in part, an answer from an image that is too old to be true.
 
-pub mod client;
 pub mod admission;
 pub mod buffers;
+pub mod client;
 pub mod config;
 pub mod device;
+pub mod gateway;
 pub mod identity;
 pub mod line;
 pub mod line_state;
-pub mod gateway;
 pub mod map;
 pub mod map_config;
 pub mod process_image;

@@ -290,7 +290,10 @@ mod tests {
         }
         assert_eq!(state.event_count(), 1);
         assert_eq!(state.diagnose(0x14, 0), Diagnosed::Echo);
-        assert_eq!((state.diagnose(0x12, 0), state.diagnose(2, 0)), (Diagnosed::Value(0), Diagnosed::Value(0)));
+        assert_eq!(
+            (state.diagnose(0x12, 0), state.diagnose(2, 0)),
+            (Diagnosed::Value(0), Diagnosed::Value(0))
+        );
         assert_eq!(state.diagnose(0x0A, 0), Diagnosed::Echo);
         assert_eq!((state.event_count(), state.message_count(), log(&state).len()), (0, 0, 5));
     }

@@ -45,7 +45,10 @@ impl Bench {
     /// The driver tells that an answer of this service has left.
     fn echo(&mut self, flags: u32, bytes: &[u8]) {
         let flags = flags | serial_flag::TX_ECHO;
-        self.take(SerialChunk { flags, tx_writer: WRITER, tx_generation: 1, ..SerialChunk::default() }, bytes);
+        self.take(
+            SerialChunk { flags, tx_writer: WRITER, tx_generation: 1, ..SerialChunk::default() },
+            bytes,
+        );
     }
 
     fn frame(&mut self, bytes: &[u8]) -> Vec<Vec<u8>> {
@@ -164,7 +167,9 @@ fn damaged_frames_are_counted_and_not_requests() {
     bench.chunk(serial_flag::GAP | serial_flag::END, &good);
     assert_eq!((bench.sent.len(), bench.line.counters().gaps), (1, 1));
     bench.sent.clear();
-    let told = |bench: &mut Bench, sub: &str| to_hex(&bench.frame(&rtu_of(5, &hex(&format!("08 00{sub} 0000"))))[0][4..6]);
+    let told = |bench: &mut Bench, sub: &str| {
+        to_hex(&bench.frame(&rtu_of(5, &hex(&format!("08 00{sub} 0000"))))[0][4..6])
+    };
     assert_eq!(told(&mut bench, "0C"), "0009");
     assert_eq!(told(&mut bench, "12"), "0002");
     assert_eq!(told(&mut bench, "0B"), "0004");
@@ -178,7 +183,11 @@ fn echoes_confirm_answers_and_are_never_requests() {
     bench.echo(serial_flag::END, &good);
     // Of another writer: the echo of a master on the same port.
     bench.take(
-        SerialChunk { flags: serial_flag::TX_ECHO | serial_flag::END, tx_writer: 99, ..SerialChunk::default() },
+        SerialChunk {
+            flags: serial_flag::TX_ECHO | serial_flag::END,
+            tx_writer: 99,
+            ..SerialChunk::default()
+        },
         &good,
     );
     assert!(bench.sent.is_empty());
@@ -361,6 +370,9 @@ fn the_longest_frame_fits() {
     for mode in [Mode::Rtu, Mode::Ascii] {
         let mut bench = Bench::new(mode, &[(5, 0)]);
         assert_eq!(bench.frame(&of(mode, 5, &pdu)), [of(mode, 5, &hex("10 0000 007B"))]);
-        assert_eq!(bench.frame(&of(mode, 5, &hex("03 0000 007D"))), [of(mode, 5, &[&[3, 250][..], &[0; 250]].concat())]);
+        assert_eq!(
+            bench.frame(&of(mode, 5, &hex("03 0000 007D"))),
+            [of(mode, 5, &[&[3, 250][..], &[0; 250]].concat())]
+        );
     }
 }

@@ -201,7 +201,9 @@ pub enum MapError {
         "map table {entry}: order {order} is for values of {bits} bits, but {got} has others; write AB or BA for %xW, ABCD, CDAB, BADC or DCBA for %xD and %xL"
     )]
     Order { entry: usize, order: &'static str, bits: &'static str, got: String },
-    #[error("map table {entry}: own = true lets clients write what read_only = true forbids; keep one of them")]
+    #[error(
+        "map table {entry}: own = true lets clients write what read_only = true forbids; keep one of them"
+    )]
     OwnReadOnly { entry: usize },
     #[error(
         "map table {entry}: own = true is for %I in coils or holding_registers, which clients can write; got {got} in {table}"

@@ -1,8 +1,8 @@
 use super::*;
-use crate::map_config::{MapConfig, Preset};
-use crate::protocol::pdu::MAX_PDU;
 use crate::identity::Identity;
 use crate::line_state::LineState;
+use crate::map_config::{MapConfig, Preset};
+use crate::protocol::pdu::MAX_PDU;
 use crate::server::{Unit, answer};
 use crate::testing::{hex, to_hex};
 use dinrail_iec::Addressing;

@@ -176,9 +176,10 @@ impl Rights {
     /// Whether this request may be carried out.
     pub fn allow(&self, peer: &Peer, unit: u8, pdu: &[u8]) -> bool {
         let code = pdu.first().copied().unwrap_or(0);
-        let rule = self.rules.iter().find(|rule| {
-            rule.peer.matches(peer) && holds(&rule.units, unit) && holds(&rule.functions, code)
-        });
+        let rule = self
+            .rules
+            .iter()
+            .find(|rule| rule.peer.matches(peer) && holds(&rule.units, unit) && holds(&rule.functions, code));
         match rule.map(|rule| rule.allow) {
             None | Some(Allow::All) => true,
             Some(Allow::Read) => is_read_only(code, pdu),
@@ -246,7 +247,9 @@ mod tests {
         for code in [5, 6, 15, 16, 21, 22, 23] {
             assert!(!allowed(&[code]), "{code}");
         }
-        for (sub, read) in [(0, true), (1, false), (2, true), (3, false), (4, false), (10, false), (11, true), (20, false)] {
+        for (sub, read) in
+            [(0, true), (1, false), (2, true), (3, false), (4, false), (10, false), (11, true), (20, false)]
+        {
             assert_eq!(allowed(&[8, 0, sub, 0, 0]), read, "{sub}");
         }
     }

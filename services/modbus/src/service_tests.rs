@@ -114,7 +114,11 @@ fn wiring_of_lines_and_the_list_of_clients() {
     let reads: Vec<_> = wiring.reads.iter().map(|r| (r.topic.as_str(), r.wake, r.key.as_str())).collect();
     assert_eq!(
         reads,
-        [("plc/image", false, "plc"), ("com1/rx", true, "serial[0].port"), ("com2/rx", true, "serial[1].port")]
+        [
+            ("plc/image", false, "plc"),
+            ("com1/rx", true, "serial[0].port"),
+            ("com2/rx", true, "serial[1].port")
+        ]
     );
     assert_eq!(wiring.writes[2], ("com2/tx".to_owned(), "serial[1].port".to_owned()));
     assert_eq!(wiring.listeners.iter().map(|l| l.key.as_str()).collect::<Vec<_>>(), ["rtu_over_tcp.port"]);
@@ -255,8 +259,13 @@ fn the_largest_status_fits_its_topic() {
         last_unit: 255,
         last_function: 255,
     };
-    let counters = LineCounters { bus_messages: u64::MAX, by_exception: [u64::MAX; 12], ..LineCounters::default() };
-    let line = || LineStatus { port: "a_long_name_of_a_serial_port", counters: &counters, rail: ReadCounters::default() };
+    let counters =
+        LineCounters { bus_messages: u64::MAX, by_exception: [u64::MAX; 12], ..LineCounters::default() };
+    let line = || LineStatus {
+        port: "a_long_name_of_a_serial_port",
+        counters: &counters,
+        rail: ReadCounters::default(),
+    };
     let lines: Vec<_> = (0..crate::config::MAX_LINES).map(|_| line()).collect();
     let body = StatusBody {
         enabled: false,

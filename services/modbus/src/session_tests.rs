@@ -70,7 +70,8 @@ fn device_frames_are_answered_byte_for_byte() {
                 image.input[..2].copy_from_slice(&[11, 22]);
             }
         }
-        let (answers, _) = feed(&mut Session::default(), &mut image, &mut tcp_device(), &hex(row[3]), usize::MAX);
+        let (answers, _) =
+            feed(&mut Session::default(), &mut image, &mut tcp_device(), &hex(row[3]), usize::MAX);
         assert_eq!(answers, hex(row[4]), "{row:?}");
         answered += 1;
     }

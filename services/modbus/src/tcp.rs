@@ -442,10 +442,10 @@ impl<B: Backend + 'static> Hub<B> {
             match read {
                 None => session.silence(),
                 Some(read) => match read {
-                Ok(0) => return CloseReason::Peer,
-                Ok(n) => session.received(n),
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
-                Err(_) => return CloseReason::Error,
+                    Ok(0) => return CloseReason::Peer,
+                    Ok(n) => session.received(n),
+                    Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+                    Err(_) => return CloseReason::Error,
                 },
             }
             loop {

@@ -208,7 +208,8 @@ impl Image for MemoryImage {
     fn write_files(&mut self, groups: &[u8]) -> Result<(), Exception> {
         for group in files::write_groups(groups) {
             let records = self.files.get_mut(&group.file).unwrap();
-            for (pair, record) in group.values.chunks_exact(2).zip(&mut records[usize::from(group.record)..]) {
+            for (pair, record) in group.values.chunks_exact(2).zip(&mut records[usize::from(group.record)..])
+            {
                 *record = u16::from_be_bytes([pair[0], pair[1]]);
             }
         }

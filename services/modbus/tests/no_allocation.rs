@@ -3,11 +3,11 @@
 
 use dinrail_iec::Addressing;
 use dinrail_modbus::config::OnStop;
+use dinrail_modbus::device::{Device, Shared};
+use dinrail_modbus::line::{Line, Mode};
 use dinrail_modbus::map_config::MapConfig;
 use dinrail_modbus::process_image::{NotQueued, ProcessImage, Rail};
 use dinrail_modbus::protocol::{ascii, mbap, rtu};
-use dinrail_modbus::device::{Device, Shared};
-use dinrail_modbus::line::{Line, Mode};
 use dinrail_modbus::rights::Peer;
 use dinrail_modbus::session::{Next, Session};
 use dinrail_modbus::tcp::Backend;

@@ -136,7 +136,9 @@ fn serial_line_and_switch(client: &mut Client) {
     let port = client.stream.local_addr().unwrap().port().to_le_bytes();
     let list = [1, 0, 127, 0, 0, 1, port[0], port[1], 0, 0, 0, 0, 0, 0];
     client.shows(|shown| shown.inputs.get(4..18) == Some(&list[..]));
-    client.shows(|shown| shown.status["serial"][0]["sent"] == 3 && shown.status["serial"][0]["crc_errors"] == 1);
+    client.shows(|shown| {
+        shown.status["serial"][0]["sent"] == 3 && shown.status["serial"][0]["crc_errors"] == 1
+    });
 
     // Off and on by command, by the bit.
     assert_eq!(client.job(r#"{ "do": "fly" }"#), 3);

@@ -458,7 +458,7 @@ fn prepare(port: &mut Port, shown: &str, options: &Options) -> Result<(), PortEr
             sys::set_rs485(port.fd(), Some(rs485)).map_err(|source| match source.raw_os_error() {
                 Some(libc::ENOTTY | libc::EINVAL) => PortError::NoRs485(shown.to_owned()),
                 _ => PortError::System { path: shown.to_owned(), what: "switching on RS-485", source },
-            })?
+            })?;
         }
         // What an earlier program left on would switch a second time.
         None if sys::rs485_enabled(port.fd()).unwrap_or(false) => {

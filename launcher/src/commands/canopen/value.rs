@@ -82,10 +82,6 @@ pub fn hex(data: &[u8]) -> String {
     data.iter().map(|b| format!("{b:02X}")).collect::<Vec<_>>().join(" ")
 }
 
-pub fn from_hex(text: &str) -> Option<Vec<u8>> {
-    bytes(text, "hex").ok()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -128,7 +128,7 @@ pub fn write(
         } else if answer.get("broadcast").is_some() {
             println(&format!("{}: broadcast, nobody confirms it", point.number(0)));
         } else {
-            println(&format!("{}: {} written", point.number(0), values.len()));
+            println(&format!("{}: {} written", point.number(0), point.count));
         }
     }
     Ok(())

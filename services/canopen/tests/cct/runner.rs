@@ -219,6 +219,10 @@ impl<'a> Run<'a> {
         }
     }
     fn tx(&mut self, id: u32, data: &[u8]) {
+        if matches!(id, 0x000 | 0x604) {
+            // Another phase of the case.
+            self.beat_ns = None;
+        }
         self.in_flight = id == 0 && matches!(data[0], 0x02 | 0x81 | 0x82);
         match id {
             0x080 => {

@@ -18,6 +18,7 @@
 //! | `identification` | `code` (1), `object` (0) | 43/14 |
 //! | `raw` | `pdu` ("03 00 00 00 01") | any |
 
+use super::image::read_request;
 use crate::protocol::client_fit::{Fit, fit};
 use crate::protocol::pdu::{
     COIL_ON, Exception, MAX_PDU, MAX_READ_BITS, MAX_READ_WORDS, MAX_READ_WRITE_WORDS, MAX_WRITE_BITS,
@@ -25,7 +26,6 @@ use crate::protocol::pdu::{
 };
 use crate::server::Table;
 use serde_json::{Value, json};
-use super::image::read_request;
 
 /// Every `do`.
 pub const KNOWN: &str = "read, write, mask, read_write, exception_status, diagnostics, event_counter, event_log, server_id, read_file, write_file, read_fifo, identification, raw, status";
@@ -70,10 +70,8 @@ impl Ask {
 
     /// The request of a job.
     pub fn from_json(job: &Value) -> Result<Self, AskError> {
-        let what = job
-            .get("do")
-            .and_then(Value::as_str)
-            .ok_or(AskError::Lacks { key: "do", what: "a text" })?;
+        let what =
+            job.get("do").and_then(Value::as_str).ok_or(AskError::Lacks { key: "do", what: "a text" })?;
         let at = |key| number(job, key, 0, 65_535, None).map(|n| (n as u16).to_be_bytes());
         Ok(match what {
             "read" => {
@@ -89,8 +87,14 @@ impl Ask {
                 let count = number(job, "count", 1, i64::from(MAX_READ_WORDS), Some(1))? as u16;
                 let words = words(job, MAX_READ_WRITE_WORDS)?;
                 let quantity = (words.len() as u16 / 2).to_be_bytes();
-                let head: [&[u8]; 6] =
-                    [&[23], &at("at")?, &count.to_be_bytes(), &at("write_at")?, &quantity, &[words.len() as u8]];
+                let head: [&[u8]; 6] = [
+                    &[23],
+                    &at("at")?,
+                    &count.to_be_bytes(),
+                    &at("write_at")?,
+                    &quantity,
+                    &[words.len() as u8],
+                ];
                 Self::new(&[head[0], head[1], head[2], head[3], head[4], head[5], &words])
             }
             "exception_status" => Self::new(&[&[7]]),
@@ -180,7 +184,13 @@ pub fn exception_words(code: u8, function: u8) -> String {
     format!("exception {code:02X} to function {}{name}: {meaning}", function & 0x7F)
 }
 
-fn number(job: &Value, key: &'static str, low: i64, high: i64, default: Option<i64>) -> Result<i64, AskError> {
+fn number(
+    job: &Value,
+    key: &'static str,
+    low: i64,
+    high: i64,
+    default: Option<i64>,
+) -> Result<i64, AskError> {
     let value = match job.get(key) {
         None => default,
         Some(value) => value.as_i64(),
@@ -265,9 +275,7 @@ fn text(bytes: &[u8]) -> String {
 
 /// An answer that fits. Values of bits are 0 and 1.
 fn explain(request: &[u8], answer: &[u8]) -> Value {
-    let word = |at: usize| {
-        answer.get(at..at + 2).map_or(0, |b| u16::from_be_bytes([b[0], b[1]]))
-    };
+    let word = |at: usize| answer.get(at..at + 2).map_or(0, |b| u16::from_be_bytes([b[0], b[1]]));
     match answer[0] {
         1 | 2 => {
             let count = usize::from(u16::from_be_bytes([request[3], request[4]]));

@@ -12,18 +12,33 @@ fn requests_of_every_function() {
         (json!({ "do": "read", "table": "input_registers", "at": 8 }), "04 00 08 00 01"),
         (json!({ "do": "write", "table": "coils", "at": 172, "values": [true] }), "05 00 AC FF 00"),
         (json!({ "do": "write", "table": "holding", "at": 1, "values": [3] }), "06 00 01 00 03"),
-        (json!({ "do": "write", "table": "holding", "at": 1, "values": [-1], "multiple": true }), "10 00 01 00 01 02 FF FF"),
+        (
+            json!({ "do": "write", "table": "holding", "at": 1, "values": [-1], "multiple": true }),
+            "10 00 01 00 01 02 FF FF",
+        ),
         (json!({ "do": "exception_status" }), "07"),
         (json!({ "do": "diagnostics", "sub": 0, "data": 0xA537 }), "08 00 00 A5 37"),
         (json!({ "do": "event_counter" }), "0B"),
         (json!({ "do": "event_log" }), "0C"),
-        (json!({ "do": "write", "table": "coils", "at": 19, "values": [1,0,1,1,0,0,1,1,1,0] }), "0F 00 13 00 0A 02 CD 01"),
-        (json!({ "do": "write", "table": "holding", "at": 1, "values": [10, 258] }), "10 00 01 00 02 04 00 0A 01 02"),
+        (
+            json!({ "do": "write", "table": "coils", "at": 19, "values": [1,0,1,1,0,0,1,1,1,0] }),
+            "0F 00 13 00 0A 02 CD 01",
+        ),
+        (
+            json!({ "do": "write", "table": "holding", "at": 1, "values": [10, 258] }),
+            "10 00 01 00 02 04 00 0A 01 02",
+        ),
         (json!({ "do": "server_id" }), "11"),
         (json!({ "do": "read_file", "file": 4, "record": 1, "count": 2 }), "14 07 06 00 04 00 01 00 02"),
-        (json!({ "do": "write_file", "file": 4, "record": 7, "values": [1711, 1214, 4109] }), "15 0D 06 00 04 00 07 00 03 06 AF 04 BE 10 0D"),
+        (
+            json!({ "do": "write_file", "file": 4, "record": 7, "values": [1711, 1214, 4109] }),
+            "15 0D 06 00 04 00 07 00 03 06 AF 04 BE 10 0D",
+        ),
         (json!({ "do": "mask", "at": 4, "and": 242, "or": 37 }), "16 00 04 00 F2 00 25"),
-        (json!({ "do": "read_write", "at": 3, "count": 6, "write_at": 14, "values": [255, 255, 255] }), "17 00 03 00 06 00 0E 00 03 06 00 FF 00 FF 00 FF"),
+        (
+            json!({ "do": "read_write", "at": 3, "count": 6, "write_at": 14, "values": [255, 255, 255] }),
+            "17 00 03 00 06 00 0E 00 03 06 00 FF 00 FF 00 FF",
+        ),
         (json!({ "do": "read_fifo", "at": 1246 }), "18 04 DE"),
         (json!({ "do": "identification" }), "2B 0E 01 00"),
         (json!({ "do": "raw", "pdu": "64 0102" }), "64 01 02"),
@@ -36,19 +51,49 @@ fn requests_of_every_function() {
 fn answers_in_words() {
     let ask = |job: Value| Ask::from_json(&job).unwrap();
     for (job, answer, expected) in [
-        (json!({ "do": "read", "table": "coils", "at": 0, "count": 3 }), "01 01 05", json!({ "values": [1, 0, 1] })),
-        (json!({ "do": "read", "table": "holding", "at": 0, "count": 2 }), "03 04 00 01 FF FF", json!({ "values": [1, 65535] })),
-        (json!({ "do": "write", "table": "holding", "at": 1, "values": [3] }), "06 00 01 00 03", json!({ "written": 1 })),
+        (
+            json!({ "do": "read", "table": "coils", "at": 0, "count": 3 }),
+            "01 01 05",
+            json!({ "values": [1, 0, 1] }),
+        ),
+        (
+            json!({ "do": "read", "table": "holding", "at": 0, "count": 2 }),
+            "03 04 00 01 FF FF",
+            json!({ "values": [1, 65535] }),
+        ),
+        (
+            json!({ "do": "write", "table": "holding", "at": 1, "values": [3] }),
+            "06 00 01 00 03",
+            json!({ "written": 1 }),
+        ),
         (json!({ "do": "exception_status" }), "07 6D", json!({ "status": 0x6D })),
         (json!({ "do": "diagnostics", "sub": 11 }), "08 00 0B 00 09", json!({ "sub": 11, "data": [9] })),
         (json!({ "do": "event_counter" }), "0B FF FF 01 08", json!({ "busy": true, "events": 264 })),
-        (json!({ "do": "event_log" }), "0C 08 00 00 01 08 01 21 20 00",
-         json!({ "busy": false, "events": 264, "messages": 289, "log": "20 00" })),
-        (json!({ "do": "server_id" }), "11 04 01 FF 41 42", json!({ "id": 1, "running": true, "text": "AB", "bytes": "01 FF 41 42" })),
-        (json!({ "do": "read_file", "file": 4, "record": 1, "count": 2 }), "14 06 05 06 0D FE 00 20", json!({ "values": [3582, 32] })),
-        (json!({ "do": "read_fifo", "at": 1246 }), "18 00 06 00 02 01 B8 12 84", json!({ "values": [440, 4740] })),
-        (json!({ "do": "identification" }), "2B 0E 01 01 00 00 01 00 02 41 FF",
-         json!({ "conformity": 1, "more": false, "next": 0, "objects": [{ "id": 0, "name": "VendorName", "text": "A\\xff" }] })),
+        (
+            json!({ "do": "event_log" }),
+            "0C 08 00 00 01 08 01 21 20 00",
+            json!({ "busy": false, "events": 264, "messages": 289, "log": "20 00" }),
+        ),
+        (
+            json!({ "do": "server_id" }),
+            "11 04 01 FF 41 42",
+            json!({ "id": 1, "running": true, "text": "AB", "bytes": "01 FF 41 42" }),
+        ),
+        (
+            json!({ "do": "read_file", "file": 4, "record": 1, "count": 2 }),
+            "14 06 05 06 0D FE 00 20",
+            json!({ "values": [3582, 32] }),
+        ),
+        (
+            json!({ "do": "read_fifo", "at": 1246 }),
+            "18 00 06 00 02 01 B8 12 84",
+            json!({ "values": [440, 4740] }),
+        ),
+        (
+            json!({ "do": "identification" }),
+            "2B 0E 01 01 00 00 01 00 02 41 FF",
+            json!({ "conformity": 1, "more": false, "next": 0, "objects": [{ "id": 0, "name": "VendorName", "text": "A\\xff" }] }),
+        ),
         (json!({ "do": "raw", "pdu": "64 01" }), "64 07", json!({ "pdu": "64 07" })),
     ] {
         let ask = ask(job);

@@ -157,7 +157,12 @@ impl WriteTable {
             .iter()
             .map(|range| {
                 let bytes = if range.table.is_bits() { range.count.div_ceil(8) } else { range.count * 2 };
-                Output { range: range.clone(), handed: None, values: vec![0; usize::from(bytes)], due_ns: None }
+                Output {
+                    range: range.clone(),
+                    handed: None,
+                    values: vec![0; usize::from(bytes)],
+                    due_ns: None,
+                }
             })
             .collect();
         Self { outputs, running: false, outside: 0 }
@@ -212,7 +217,11 @@ impl WriteTable {
     /// The unit was gone and is back: it gets all values again.
     pub fn again(&mut self, line: usize, unit: u8, now_ns: u64, mut write: impl FnMut(usize, &[u8])) {
         for (i, output) in self.outputs.iter_mut().enumerate() {
-            if self.running && output.range.line == line && output.range.unit == unit && output.handed.is_some() {
+            if self.running
+                && output.range.line == line
+                && output.range.unit == unit
+                && output.handed.is_some()
+            {
                 output.hand_over(i, now_ns, &mut write);
             }
         }

@@ -6,13 +6,19 @@ use dinrail_iec::Addressing;
 use serde_json::{Value, json};
 
 fn reads(value: Value) -> InputTable {
-    let plan = plan(&serde_json::from_value(json!({ "serial": "com1", "read": value })).unwrap(), Addressing::Element);
+    let plan = plan(
+        &serde_json::from_value(json!({ "serial": "com1", "read": value })).unwrap(),
+        Addressing::Element,
+    );
     assert_eq!(plan.mistakes, []);
     InputTable::new(&plan.reads)
 }
 
 fn writes(value: Value) -> WriteTable {
-    let plan = plan(&serde_json::from_value(json!({ "serial": "com1", "write": value })).unwrap(), Addressing::Element);
+    let plan = plan(
+        &serde_json::from_value(json!({ "serial": "com1", "write": value })).unwrap(),
+        Addressing::Element,
+    );
     assert_eq!(plan.mistakes, []);
     WriteTable::new(&plan.writes)
 }
@@ -30,13 +36,19 @@ fn registers_and_bits_in_every_form() {
         { "unit": 1, "table": "coils", "at": 5, "to": "%IX20.3" },
         { "unit": 1, "table": "coils", "at": 6, "count": 10, "to": "%IX21.0", "timeout": "1s", "on_bad": "zero" },
     ]));
-    assert_eq!(table.tail(), [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, NO_DATA, NO_DATA, NO_DATA, NO_DATA, NO_DATA]);
+    assert_eq!(
+        table.tail(),
+        [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, NO_DATA, NO_DATA, NO_DATA, NO_DATA, NO_DATA]
+    );
     // One answer with registers 0 to 4: a number, 11223344h with its low word first, the text "Abcd".
     let data = [0x12, 0x34, 0x33, 0x44, 0x11, 0x22, b'A', b'b', b'c', b'd'];
     assert!(table.data(0, &data, 0, 10) && table.data(1, &data, 1, 10) && table.data(2, &data, 3, 10));
     assert_eq!(table.tail()[..10], [0x34, 0x12, 0x44, 0x33, 0x22, 0x11, b'A', b'b', b'c', b'd']);
     // Bits 5 to 15 in one answer.
-    assert!(table.data(3, &[0b0000_0111, 0b0000_0100], 0, 10) && table.data(4, &[0b0000_0111, 0b0000_0100], 1, 10));
+    assert!(
+        table.data(3, &[0b0000_0111, 0b0000_0100], 0, 10)
+            && table.data(4, &[0b0000_0111, 0b0000_0100], 1, 10)
+    );
     assert_eq!(table.tail()[10..], [1, 0b0000_0011, 0b0000_0010, GOOD, GOOD, GOOD, GOOD, GOOD]);
     assert_eq!(table.drain_changes().count(), 5);
     assert!(!table.data(0, &[1], 0, 11) && !table.data(4, &[1], 1, 11) && !table.data(9, &[1], 0, 11));

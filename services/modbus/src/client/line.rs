@@ -15,8 +15,14 @@
 //! Nothing in here allocates after [`Line::new`], but the queue of jobs when it grows for the first time.
 
 use crate::protocol::client_fit::{Fit, fit};
-use crate::protocol::pdu::MAX_PDU;
 use std::collections::VecDeque;
+
+mod types;
+
+use types::Pdu;
+pub use types::{
+    Failure, LineCounters, Origin, QueueFull, Settings, SlotKind, Step, UnitCounters, UnitSettings, UnitState, UnitView,
+};
 
 /// Most jobs that wait for a line.
 pub const MAX_JOBS: usize = 64;
@@ -28,143 +34,6 @@ pub const LONE_PROBE_NS: u64 = 5_000_000_000;
 const WRITES_IN_A_ROW: u32 = 8;
 /// Shortest and longest pause after the port or connection failed.
 const LINK_PAUSE_NS: (u64, u64) = (100_000_000, 5_000_000_000);
-
-/// What is true for the whole line.
-#[derive(Debug, Clone, Copy)]
-pub struct Settings {
-    /// Answers have no transaction number: a serial line.
-    pub serial: bool,
-    /// Unit 0 is a broadcast: nobody answers, and this long nothing is sent behind it. `None`: unit 0 is a unit.
-    pub turnaround_ns: Option<u64>,
-    /// A request that is not sent after this time has failed.
-    pub send_limit_ns: u64,
-}
-
-/// What is true for a unit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct UnitSettings {
-    /// From the end of the request to the end of the answer.
-    pub response_timeout_ns: u64,
-    /// Repetitions after the first try.
-    pub retries: u8,
-    /// First interval between tries of a dead unit; doubled each time.
-    pub probe_min_ns: u64,
-    /// Largest one.
-    pub probe_max_ns: u64,
-}
-
-impl Default for UnitSettings {
-    fn default() -> Self {
-        Self {
-            response_timeout_ns: 1_000_000_000,
-            retries: 1,
-            probe_min_ns: 1_000_000_000,
-            probe_max_ns: 60_000_000_000,
-        }
-    }
-}
-
-/// What a slot is for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum SlotKind {
-    /// Sent every period.
-    Read,
-    /// Sent when it was set ([`Line::set_write`]), before reads.
-    Write,
-}
-
-/// Who asked.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Origin {
-    /// Number from [`Line::add_slot`].
-    Slot(usize),
-    /// Number given to [`Line::push_job`].
-    Job(u64),
-}
-
-/// Why a request got no answer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Failure {
-    /// Not in time, also when repeated.
-    NoAnswer,
-    /// Not tried: the unit did not answer lately and its next try is not due.
-    UnitDown,
-    /// The port or the connection does not work.
-    Link,
-    /// Nobody waits any more.
-    Expired,
-    /// An answer came that cannot be the one to this request.
-    Mismatch,
-}
-
-/// What the owner of the line has to do.
-#[derive(Debug, PartialEq, Eq)]
-pub enum Step<'a> {
-    /// Send this; then say [`Line::sent`] or [`Line::link_failed`].
-    Send { unit: u8, pdu: &'a [u8], origin: Origin },
-    /// A request has ended: answer PDU (exceptions too; empty for a broadcast) or failure.
-    Done { origin: Origin, unit: u8, result: Result<&'a [u8], Failure> },
-    /// Drop the connection: an answer may still come on it.
-    Reset,
-    /// Nothing before this time, unless something happens.
-    Wait(Option<u64>),
-}
-
-/// Why a job is not taken.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("{MAX_JOBS} requests wait for the line already; ask again later")]
-pub struct QueueFull;
-
-/// State of a unit in words.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum UnitState {
-    /// Not asked yet.
-    Unknown,
-    Ok,
-    /// A request is being repeated.
-    Failing,
-    /// Left alone between tries.
-    Dead,
-}
-
-/// Counters of a unit.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
-pub struct UnitCounters {
-    /// Requests sent, repetitions too.
-    pub requests: u64,
-    /// Answers that fitted, exceptions too.
-    pub answers: u64,
-    pub exceptions: u64,
-    pub timeouts: u64,
-    pub retries: u64,
-    /// Answers that did not fit the request in flight.
-    pub discarded: u64,
-}
-
-/// A unit as the status shows it.
-#[derive(Debug, Clone, Copy)]
-pub struct UnitView {
-    pub unit: u8,
-    pub state: UnitState,
-    pub counters: UnitCounters,
-    pub last_exception: Option<u8>,
-    pub last_rtt_ns: Option<u64>,
-    pub max_rtt_ns: u64,
-}
-
-/// Counters of a line.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
-pub struct LineCounters {
-    /// Frames of units that were not asked, or with nothing in flight.
-    pub late: u64,
-    /// Frames that are none: CRC, LRC, line errors.
-    pub garbage: u64,
-    pub link_failures: u64,
-    /// Periods of reads that passed without a turn.
-    pub missed_periods: u64,
-}
 
 struct Unit {
     number: u8,
@@ -188,36 +57,6 @@ struct Unit {
 struct Suspect {
     pdu: Pdu,
     until_ns: u64,
-}
-
-#[derive(Clone, Copy)]
-struct Pdu {
-    bytes: [u8; MAX_PDU],
-    len: u8,
-}
-
-impl Pdu {
-    fn new(pdu: &[u8]) -> Self {
-        let mut bytes = [0; MAX_PDU];
-        let len = pdu.len().min(MAX_PDU);
-        bytes[..len].copy_from_slice(&pdu[..len]);
-        Self { bytes, len: len as u8 }
-    }
-    fn get(&self) -> &[u8] {
-        &self.bytes[..usize::from(self.len)]
-    }
-    /// Whether a late answer to `self` would be taken for one to `other`.
-    fn confusable(&self, other: &[u8]) -> bool {
-        // Function and quantity are all that an answer to a read tells of its request.
-        let [f, _, _, q1, q0, ..] = *self.get() else { return false };
-        self.get() != other && matches!(f, 1..=4 | 23) && other.first() == Some(&f) && {
-            let bytes = |q: &[u8]| {
-                let n = usize::from(u16::from_be_bytes([q[0], q[1]]));
-                if f <= 2 { n.div_ceil(8) } else { n * 2 }
-            };
-            other.get(3..5).is_some_and(|q| bytes(q) == bytes(&[q1, q0]))
-        }
-    }
 }
 
 struct Slot {
@@ -447,7 +286,6 @@ impl Line {
         if !matches!(flight.phase, Phase::Sending) {
             return;
         }
-        self.link_level = 0;
         flight.sent_ns = now_ns;
         let unit = &self.units[flight.unit];
         match self.settings.turnaround_ns.filter(|_| unit.number == 0) {
@@ -475,11 +313,7 @@ impl Line {
             Phase::Sending => !self.settings.serial,
             Phase::Turnaround => false,
         };
-        let fitting = if asked.number == unit && awaited {
-            fit(flight.pdu.get(), pdu)
-        } else {
-            Fit::No
-        };
+        let fitting = if asked.number == unit && awaited { fit(flight.pdu.get(), pdu) } else { Fit::No };
         match fitting {
             Fit::No if self.settings.serial => {
                 if asked.number == unit {

@@ -299,7 +299,8 @@ fn a_dead_unit_among_ten_costs_the_other_nine_less_than_5_percent() {
             assert!(beside > 0.95 * alone, "unit {number}: {beside} of {alone} at {timeout_ms} ms");
         }
         // All alike.
-        let (least, most) = (1..=9).fold((u64::MAX, 0), |(l, m), n| (l.min(with_dead[&n]), m.max(with_dead[&n])));
+        let (least, most) =
+            (1..=9).fold((u64::MAX, 0), |(l, m), n| (l.min(with_dead[&n]), m.max(with_dead[&n])));
         assert!(most - least <= 1, "{with_dead:?}");
     }
 }

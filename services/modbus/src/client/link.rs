@@ -14,12 +14,13 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::sync::mpsc;
 use tokio_modbus::client::{Client, Context, tcp::attach_slave};
-use tokio_modbus::prelude::{Request, Response, Slave, SlaveContext};
+use tokio_modbus::prelude::{ProtocolError, Request, Response, Slave, SlaveContext};
 
 /// An order to a link.
 #[derive(Debug)]
 pub enum Order {
-    Send { unit: u8, pdu: Vec<u8> },
+    /// `seq` comes back with every report about it, so that a report of an earlier one is told apart.
+    Send { seq: u64, unit: u8, pdu: Vec<u8> },
     /// Drop the connection, and with it what is under way.
     Drop,
 }
@@ -31,16 +32,23 @@ pub enum Report {
     Connected,
     /// The request is on its way.
     Sent,
-    Answer { unit: u8, pdu: Vec<u8> },
+    Answer {
+        unit: u8,
+        pdu: Vec<u8>,
+    },
     /// The connection cannot be made or broke.
     Failed(String),
     /// Bytes that are no frame.
     Garbage,
 }
 
+/// Number of the line, of the order, and what happened.
+pub type Reports = mpsc::UnboundedSender<(usize, u64, Report)>;
+
 /// The orders' end of a link.
 pub struct Link {
     orders: mpsc::UnboundedSender<Order>,
+    seq: u64,
 }
 
 impl Link {
@@ -49,21 +57,27 @@ impl Link {
         line: usize,
         target: &Target,
         connect_timeout: Duration,
-        reports: mpsc::UnboundedSender<(usize, Report)>,
+        reports: Reports,
     ) -> Option<Self> {
         // One request is in flight, so a queue never holds more than an order to send and one to drop.
         let (orders, inbox) = mpsc::unbounded_channel();
-        let task = Task { line, orders: inbox, reports, connect_timeout };
+        let task = Task { line, seq: 0, orders: inbox, reports, connect_timeout };
         match *target {
             Target::Tcp(address) => tokio::task::spawn_local(task.tcp(address)),
             Target::RtuOverTcp(address) => tokio::task::spawn_local(task.rtu(address)),
             Target::Serial { .. } => return None,
         };
-        Some(Self { orders })
+        Some(Self { orders, seq: 0 })
     }
 
-    pub fn send(&self, unit: u8, pdu: &[u8]) {
-        let _ = self.orders.send(Order::Send { unit, pdu: pdu.to_vec() });
+    pub fn send(&mut self, unit: u8, pdu: &[u8]) {
+        self.seq += 1;
+        let _ = self.orders.send(Order::Send { seq: self.seq, unit, pdu: pdu.to_vec() });
+    }
+
+    /// Whether a report is about the last request sent.
+    pub fn is_current(&self, seq: u64) -> bool {
+        self.seq == seq
     }
 
     pub fn reset(&self) {
@@ -73,14 +87,15 @@ impl Link {
 
 struct Task {
     line: usize,
+    seq: u64,
     orders: mpsc::UnboundedReceiver<Order>,
-    reports: mpsc::UnboundedSender<(usize, Report)>,
+    reports: Reports,
     connect_timeout: Duration,
 }
 
 impl Task {
     fn tell(&self, report: Report) {
-        let _ = self.reports.send((self.line, report));
+        let _ = self.reports.send((self.line, self.seq, report));
     }
 
     /// Connects; `None`: told why not, or ordered to drop it.
@@ -106,7 +121,9 @@ impl Task {
             }
             Err(_) => {
                 let limit = self.connect_timeout;
-                self.tell(Report::Failed(format!("connecting to {address}: nobody answered within {limit:?}")));
+                self.tell(Report::Failed(format!(
+                    "connecting to {address}: nobody answered within {limit:?}"
+                )));
                 None
             }
         }
@@ -115,10 +132,11 @@ impl Task {
     async fn tcp(mut self, address: SocketAddr) {
         let mut context: Option<Context> = None;
         while let Some(order) = self.orders.recv().await {
-            let Order::Send { unit, pdu } = order else {
+            let Order::Send { seq, unit, pdu } = order else {
                 context = None;
                 continue;
             };
+            self.seq = seq;
             if context.is_none() {
                 let Some(stream) = self.connect(address).await else { continue };
                 context = Some(attach_slave(stream, Slave(unit)));
@@ -136,10 +154,19 @@ impl Task {
                 }
             };
             match answer {
-                Ok(Ok(response)) => self.tell(Report::Answer { unit, pdu: response_pdu(&response, function) }),
+                Ok(Ok(response)) => self.tell(Report::Answer { unit, pdu: response_pdu(&response) }),
                 Ok(Err(exception)) => {
                     let code = u8::from(exception);
                     self.tell(Report::Answer { unit, pdu: vec![function | EXCEPTION_BIT, code] });
+                }
+                // Requests go out as bytes ("custom"), answers come back by their meaning, which tokio-modbus takes
+                // for another function. Whether it is, the line sees: it compares the bytes.
+                Err(tokio_modbus::Error::Protocol(ProtocolError::FunctionCodeMismatch { result, .. })) => {
+                    let pdu = match result {
+                        Ok(response) => response_pdu(&response),
+                        Err(e) => vec![e.function.value() | EXCEPTION_BIT, u8::from(e.exception)],
+                    };
+                    self.tell(Report::Answer { unit, pdu });
                 }
                 Err(e) => {
                     context = None;
@@ -153,10 +180,11 @@ impl Task {
         let mut connection: Option<TcpStream> = None;
         let mut buffer = Vec::with_capacity(2 * rtu::MAX_ADU);
         while let Some(order) = self.orders.recv().await {
-            let Order::Send { unit, pdu } = order else {
+            let Order::Send { seq, unit, pdu } = order else {
                 connection = None;
                 continue;
             };
+            self.seq = seq;
             if connection.is_none() {
                 connection = self.connect(address).await;
             }
@@ -251,8 +279,8 @@ fn find_answer(unit: u8, request: &[u8], bytes: &[u8]) -> Found {
 }
 
 /// tokio-modbus decodes answers to what programs like; back to the bytes they were.
-fn response_pdu(response: &Response, function: u8) -> Vec<u8> {
-    let mut pdu = vec![function];
+fn response_pdu(response: &Response) -> Vec<u8> {
+    let mut pdu = vec![response.function_code().value()];
     let bits = |pdu: &mut Vec<u8>, values: &[bool]| {
         pdu.push(values.len().div_ceil(8) as u8);
         for eight in values.chunks(8) {

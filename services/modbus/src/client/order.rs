@@ -107,7 +107,9 @@ mod tests {
             order.turn(2, &mut bytes);
             assert_eq!(bytes, wire);
         }
-        for (order, wire) in [(Order::AB, [0x11, 0x22]), (Order::ABCD, [0x11, 0x22]), (Order::BA, [0x22, 0x11])] {
+        for (order, wire) in
+            [(Order::AB, [0x11, 0x22]), (Order::ABCD, [0x11, 0x22]), (Order::BA, [0x22, 0x11])]
+        {
             let mut bytes = wire;
             order.turn(1, &mut bytes);
             assert_eq!(u16::from_le_bytes(bytes), 0x1122, "{order:?}");

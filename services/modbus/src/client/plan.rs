@@ -208,7 +208,11 @@ fn check_whole(config: &Config, plan: &mut Plan) {
             plan.wrong("tcp", "the service has a serial line and a connection", "remove serial or tcp");
         }
         (Some(_), None, Some(Mode::Tcp)) => {
-            plan.wrong("mode", "mode \"tcp\" is for connections", "use \"rtu\" or \"ascii\" on a serial line");
+            plan.wrong(
+                "mode",
+                "mode \"tcp\" is for connections",
+                "use \"rtu\" or \"ascii\" on a serial line",
+            );
         }
         (None, _, Some(Mode::Ascii)) => {
             let help = "use \"tcp\", or \"rtu\" for a converter that passes RTU frames on";
@@ -222,7 +226,11 @@ fn check_whole(config: &Config, plan: &mut Plan) {
     }
     let words = 1..=MAX_READ_WORDS;
     if !words.contains(&config.max_batch) {
-        plan.wrong("max_batch", format!("max_batch = {} is not 1 to 125", config.max_batch), "125 is the default");
+        plan.wrong(
+            "max_batch",
+            format!("max_batch = {} is not 1 to 125", config.max_batch),
+            "125 is the default",
+        );
     }
     for (key, span) in [("response_timeout", config.response_timeout), ("probe_min", config.probe_min)] {
         if span < Span::from_ms(1) {
@@ -304,8 +312,13 @@ pub fn find_unit(lines: &[LinePlan], unit: &UnitRef, has_own: bool) -> Result<(u
             match found.as_slice() {
                 [line] => Ok((*line, *number)),
                 [] if has_own => Ok((0, *number)),
-                [] => Err(format!("no [[service.unit]] has the id {number}, and the service has no line of its own")),
-                _ => Err(format!("{} units have the id {number}; call the one you mean by its name", found.len())),
+                [] => Err(format!(
+                    "no [[service.unit]] has the id {number}, and the service has no line of its own"
+                )),
+                _ => Err(format!(
+                    "{} units have the id {number}; call the one you mean by its name",
+                    found.len()
+                )),
             }
         }
     }
@@ -354,7 +367,11 @@ fn place(addressing: Addressing, wanted: &Wanted<'_>, plan: &mut Plan) -> Option
     let address = match parse_address(wanted.address, addressing) {
         Ok(address) => address,
         Err(e) => {
-            plan.wrong(address_key, e.to_string(), "the plc service's `addressing` says how numbers are counted");
+            plan.wrong(
+                address_key,
+                e.to_string(),
+                "the plc service's `addressing` says how numbers are counted",
+            );
             return None;
         }
     };
@@ -363,7 +380,10 @@ fn place(addressing: Addressing, wanted: &Wanted<'_>, plan: &mut Plan) -> Option
         let (message, help) = if wanted.areas == [Area::Input] {
             (format!("{} is no input: what is read goes to %I", wanted.address), "write %I...")
         } else {
-            (format!("{} is no output: what is written comes from %Q or %M", wanted.address), "write %Q... or %M...")
+            (
+                format!("{} is no output: what is written comes from %Q or %M", wanted.address),
+                "write %Q... or %M...",
+            )
         };
         plan.wrong(address_key.clone(), message, help);
     }
@@ -375,7 +395,8 @@ fn place(addressing: Addressing, wanted: &Wanted<'_>, plan: &mut Plan) -> Option
         AddressSize::Word | AddressSize::Dword | AddressSize::Lword => !bits,
     };
     if !fits {
-        let help = if bits { "use X or B addresses for bits" } else { "use B, W, D or L addresses for registers" };
+        let help =
+            if bits { "use X or B addresses for bits" } else { "use B, W, D or L addresses for registers" };
         plan.wrong(address_key, format!("{} does not hold {}", wanted.address, wanted.table.name()), help);
         return None;
     }
@@ -386,7 +407,8 @@ fn place(addressing: Addressing, wanted: &Wanted<'_>, plan: &mut Plan) -> Option
     };
     let count = wanted.count.unwrap_or(default);
     if count == 0 || count > wanted.most {
-        let message = format!("{count} {} in one range: 1 to {} are possible", wanted.table.name(), wanted.most);
+        let message =
+            format!("{count} {} in one range: 1 to {} are possible", wanted.table.name(), wanted.most);
         plan.wrong(format!("{key}.count"), message, "split the range");
     } else if u32::from(wanted.at) + u32::from(count) > 65_536 {
         plan.wrong(format!("{key}.at"), "the range ends behind address 65535", "lower at or count");
@@ -404,7 +426,8 @@ fn place(addressing: Addressing, wanted: &Wanted<'_>, plan: &mut Plan) -> Option
     }
     if !wanted.order.is_for(group) || (bits && wanted.order != Order::default()) {
         let message = format!("order {} is not possible here", wanted.order.name());
-        let help = "AB and BA are for single registers, ABCD, DCBA, BADC, CDAB for %xD and %xL; bits have none";
+        let help =
+            "AB and BA are for single registers, ABCD, DCBA, BADC, CDAB for %xD and %xL; bits have none";
         plan.wrong(format!("{key}.order"), message, help);
     }
     let single = if bits { count == 1 } else { usize::from(count) == group };
@@ -555,7 +578,11 @@ fn plan_write(
         match safe_bytes(&range, write.iec, values) {
             Ok(bytes) => range.safe = Some(bytes),
             Err(message) => {
-                plan.wrong(format!("{key}.safe_values"), message, "give one number a value of the range, in its type");
+                plan.wrong(
+                    format!("{key}.safe_values"),
+                    message,
+                    "give one number a value of the range, in its type",
+                );
                 return None;
             }
         }
@@ -564,7 +591,11 @@ fn plan_write(
 }
 
 /// The values of a safe state as they go on the wire.
-fn safe_bytes(range: &WriteRange, iec: Option<super::config::IecType>, values: &[f64]) -> Result<Vec<u8>, String> {
+fn safe_bytes(
+    range: &WriteRange,
+    iec: Option<super::config::IecType>,
+    values: &[f64],
+) -> Result<Vec<u8>, String> {
     use super::config::IecType;
     let count = usize::from(range.count) / range.group;
     if values.len() != count {

@@ -34,7 +34,18 @@ fn ranges_near_each_other_are_read_at_once() {
     let shown: Vec<_> = line
         .batches
         .iter()
-        .map(|b| format!("{} {} {}+{} {:?} {:?} {}", b.unit, b.table.name(), b.at, b.count, b.members, b.alone, b.enabled))
+        .map(|b| {
+            format!(
+                "{} {} {}+{} {:?} {:?} {}",
+                b.unit,
+                b.table.name(),
+                b.at,
+                b.count,
+                b.members,
+                b.alone,
+                b.enabled
+            )
+        })
         .collect();
     assert_eq!(
         shown,
@@ -76,7 +87,10 @@ fn units_and_their_lines() {
         "write": [{ "unit": "b", "table": "coils", "at": 3, "from": "%QX0.5", "safe_values": [1] }],
     }));
     assert_eq!(plan.mistakes, []);
-    assert_eq!(plan.reads.iter().map(|r| (r.line, r.unit)).collect::<Vec<_>>(), [(1, 1), (2, 2), (0, 9), (2, 2)]);
+    assert_eq!(
+        plan.reads.iter().map(|r| (r.line, r.unit)).collect::<Vec<_>>(),
+        [(1, 1), (2, 2), (0, 9), (2, 2)]
+    );
     assert_eq!(plan.lines[1].target, Target::Tcp("10.0.0.2:502".parse().unwrap()));
     let settings = plan.lines[1].units[0].settings;
     assert_eq!((settings.response_timeout_ns, settings.retries), (300_000_000, 3));
@@ -105,9 +119,11 @@ fn mistakes_are_named() {
         said(json!({ "serial": "com1", "max_batch": 126, "response_timeout": "10us", "probe_max": "10ms" })),
         said(json!({ "serial": "com1", "unit": [{ "id": 1 }, { "id": 1 }] })),
         said(json!({ "unit": [{ "id": 1, "name": "a", "tcp": "10.0.0.1:502" }, { "id": 2, "name": "a" }] })),
-        said(json!({ "unit": [{ "id": 1, "name": "a", "tcp": "10.0.0.1:502" }, { "id": 1, "tcp": "10.0.0.2:502" }],
+        said(
+            json!({ "unit": [{ "id": 1, "name": "a", "tcp": "10.0.0.1:502" }, { "id": 1, "tcp": "10.0.0.2:502" }],
                      "read": [read(0, "%IW0"), { "unit": 1, "table": "coils", "at": 0, "to": "%IX9.0" },
-                              { "unit": "x", "table": "coils", "at": 0, "to": "%IX9.1" }] })),
+                              { "unit": "x", "table": "coils", "at": 0, "to": "%IX9.1" }] }),
+        ),
         with(json!({ "unit": 0 })),
         with(json!({ "to": "%QW0" })),
         with(json!({ "to": "%IX0.0" })),

@@ -20,10 +20,16 @@ const TAKE: usize = 256;
 #[derive(Debug, PartialEq, Eq)]
 pub enum Incoming<'a> {
     /// The last request has left; when.
-    Sent { t_ns: u64 },
+    Sent {
+        t_ns: u64,
+    },
     /// The last request did not leave.
     NotSent,
-    Frame { unit: u8, pdu: &'a [u8], t_ns: u64 },
+    Frame {
+        unit: u8,
+        pdu: &'a [u8],
+        t_ns: u64,
+    },
     /// Bytes that are no frame.
     Garbage,
 }
@@ -81,7 +87,10 @@ impl SerialPort {
             }
             // Somebody else's on the same line: what came before belongs to nothing any more.
             assembler.len = 0;
-            if chunk.tx_writer != *writer || chunk.tx_generation != *generation || Some(chunk.tx_seq) != *awaited {
+            if chunk.tx_writer != *writer
+                || chunk.tx_generation != *generation
+                || Some(chunk.tx_seq) != *awaited
+            {
                 return;
             }
             if chunk.flags & serial_flag::NOT_SENT != 0 {

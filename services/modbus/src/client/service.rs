@@ -3,20 +3,23 @@
 //! One thread, one current-thread tokio runtime; connections are tasks on it ([`super::link`]). What is exact in time
 //! comes from a timerfd ([`super::alarm`]) and from the serial driver's stamps.
 
+mod jobs;
+mod status;
+
+use self::jobs::Asker;
 use super::alarm::Alarm;
-use super::ask::{Ask, exception_words};
 use super::config::{Config, MAX_READS, SafeOn};
 use super::image::{InputTable, WriteTable, read_request};
 use super::line::{
-    Failure, Line, LineCounters, Origin, Settings, SlotKind, Step, UnitCounters, UnitSettings, UnitState,
+    Failure, Line, Origin, Settings, SlotKind, Step, UnitSettings, UnitState,
 };
-use super::link::{Link, Report};
-use super::plan::{Batch, LinePlan, Plan, Target, find_unit, plan};
+use super::link::{Link, Report, Reports};
+use super::plan::{Batch, LinePlan, Plan, Target, plan};
 use super::port::{Incoming, SEND_LIMIT_NS, SerialPort};
 use super::wiring::plc_of;
 use crate::readable;
 use ipc_types::event::{EventKind, Level};
-use ipc_types::payload::{Image, Inputs, Job, JobResult, PlcState, Quality, Stamp};
+use ipc_types::payload::{Image, Inputs, Job, JobResult, PlcState, Quality};
 use ipc_types::port::{Publisher, Subscriber};
 use ipc_types::rail::RailError;
 use ipc_types::topic::TopicKind;
@@ -39,10 +42,6 @@ const REPEAT_NS: u64 = 90_000_000;
 const EVENTS_A_SECOND: u32 = 20;
 /// Units shown in the status.
 const STATUS_UNITS: usize = 48;
-/// Jobs taken at a time.
-const TAKE_JOBS: usize = 16;
-/// A job without a deadline of its own is forgotten after this time.
-const JOB_LIMIT_NS: u64 = 60_000_000_000;
 
 /// Why the service ended.
 #[derive(Debug, thiserror::Error)]
@@ -85,13 +84,6 @@ struct Runner {
     connected: bool,
 }
 
-/// Who waits for the answer to a job.
-struct Asker {
-    stamp: Stamp,
-    ask: Ask,
-    line: usize,
-}
-
 /// Why nothing is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
@@ -127,49 +119,6 @@ pub(super) fn judge(state: PlcState, scan: u64, safe_on: &[SafeOn]) -> Option<Un
         PlcState::Fault => asked(SafeOn::Fault, Unsafe::Fault),
         PlcState::Halted => asked(SafeOn::Halted, Unsafe::Halted),
     }
-}
-
-#[derive(Serialize)]
-struct UnitRow {
-    unit: u8,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    name: Option<String>,
-    state: UnitState,
-    counters: UnitCounters,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    last_exception: Option<String>,
-    /// Of the last answer.
-    rtt_us: Option<u64>,
-    max_rtt_us: u64,
-}
-
-#[derive(Serialize)]
-struct LineRow {
-    target: String,
-    /// Of a connection: whether it stands.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    connected: Option<bool>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    trouble: Option<String>,
-    counters: LineCounters,
-    jobs_waiting: usize,
-    units: Vec<UnitRow>,
-}
-
-#[derive(Serialize)]
-struct Status {
-    lines: Vec<LineRow>,
-    ranges: usize,
-    /// Ranges of %I by quality.
-    good: usize,
-    stale: usize,
-    no_data: usize,
-    /// Absent: writes follow the image.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    safe: Option<Unsafe>,
-    jobs: u64,
-    jobs_failed: u64,
-    images_too_small: u64,
 }
 
 struct Service {
@@ -234,7 +183,7 @@ async fn serve(mut ctx: Context) -> Result<(), RunError> {
                 beats += 1;
                 service.beat(beats);
             }
-            Some((line, report)) = reports.recv() => service.report(line, report),
+            Some((line, seq, report)) = reports.recv() => service.report(line, seq, report),
             ready = inbox_fd.readable() => {
                 // First cleared, then drained: what rings in between is an edge again.
                 ready.map_err(system("waiting for the rail"))?.clear_ready();
@@ -257,7 +206,7 @@ impl Half {
 }
 
 impl Service {
-    fn new(ctx: &mut Context, reports: &mpsc::UnboundedSender<(usize, Report)>) -> Result<Half, RunError> {
+    fn new(ctx: &mut Context, reports: &Reports) -> Result<Half, RunError> {
         let config: Config = ctx.config()?;
         let name = ctx.service.clone();
         let wiring = ctx.entry().map(|entry| entry.wiring.clone()).unwrap_or_default();
@@ -371,15 +320,19 @@ impl Service {
     }
 
     /// What a connection tells.
-    fn report(&mut self, line: usize, report: Report) {
+    fn report(&mut self, line: usize, seq: u64, report: Report) {
         let Some(runner) = self.runners.get_mut(line) else { return };
+        // About a request that was given up meanwhile: it would be taken for the answer to the next one.
+        if matches!(&runner.transport, Transport::Tcp(link) if !link.is_current(seq)) {
+            return;
+        }
         let now_ns = clock::mono_ns();
         match report {
             Report::Connected => {
                 runner.connected = true;
                 if runner.trouble.take().is_some() {
                     let message = format!("connected to {} again", runner.plan.target);
-                    self.ctx.event(EventKind::BusState, Level::Info, message, Value::Null);
+                    self.tell(EventKind::BusState, Level::Info, message);
                 }
             }
             Report::Sent => runner.line.sent(now_ns),
@@ -389,7 +342,7 @@ impl Service {
                 runner.connected = false;
                 runner.line.link_failed(now_ns);
                 if runner.trouble.replace(why.clone()).is_none() {
-                    self.ctx.event(EventKind::BusState, Level::Warning, why, Value::Null);
+                    self.tell(EventKind::BusState, Level::Warning, why);
                 }
             }
         }
@@ -399,7 +352,8 @@ impl Service {
     fn pump(&mut self, line: usize) -> Option<u64> {
         loop {
             let now_ns = clock::mono_ns();
-            let Runner { line: core, transport, uses, plan, trouble, connected, .. } = &mut self.runners[line];
+            let Runner { line: core, transport, uses, plan, trouble, connected, .. } =
+                &mut self.runners[line];
             match core.step(now_ns) {
                 Step::Wait(until) => return until,
                 Step::Reset => {
@@ -473,12 +427,13 @@ impl Service {
                     self.inputs.failed(read);
                 }
             }
-            let message = format!("{} does not answer; it is tried again from time to time", self.name_of(line, unit));
-            self.tell(Level::Warning, message);
+            let message =
+                format!("{} does not answer; it is tried again from time to time", self.name_of(line, unit));
+            self.tell(EventKind::BusState, Level::Warning, message);
         } else if was_dead && answered {
             self.runners[line].dead.retain(|&d| d != unit);
             let message = format!("{} answers again", self.name_of(line, unit));
-            self.tell(Level::Info, message);
+            self.tell(EventKind::BusState, Level::Info, message);
             // It may have been switched off: it gets its values again.
             let Self { writes, runners, write_slots, .. } = self;
             writes.again(line, unit, now_ns, |i, pdu| set_write(runners, write_slots, i, pdu, now_ns));
@@ -494,13 +449,13 @@ impl Service {
         }
     }
 
-    fn tell(&mut self, level: Level, message: String) {
+    fn tell(&mut self, kind: EventKind, level: Level, message: String) {
         if self.event_budget == 0 {
             self.events_left_out += 1;
             return;
         }
         self.event_budget -= 1;
-        self.ctx.event(EventKind::InputQuality, level, message, Value::Null);
+        self.ctx.event(kind, level, message, Value::Null);
     }
 
     fn tell_quality(&mut self) {
@@ -517,7 +472,7 @@ impl Service {
             } else {
                 (Level::Warning, format!("{what} of {} is stale", self.name_of(line, unit)))
             };
-            self.tell(level, message);
+            self.tell(EventKind::InputQuality, level, message);
         }
     }
 
@@ -578,100 +533,6 @@ impl Service {
         }
     }
 
-    /// New jobs; true when more wait.
-    fn take_jobs(&mut self) -> bool {
-        let mut taken = Vec::new();
-        let count = self.jobs.drain(TAKE_JOBS, |job, tail| {
-            taken.push((job.stamp, job.deadline_t_ns, serde_json::from_slice::<Value>(tail)));
-        });
-        for (stamp, deadline_ns, job) in taken {
-            let now_ns = clock::mono_ns();
-            if deadline_ns != 0 && deadline_ns <= now_ns {
-                continue;
-            }
-            let deadline_ns = if deadline_ns == 0 { now_ns + JOB_LIMIT_NS } else { deadline_ns };
-            match job {
-                Err(e) => self.reply(&stamp, 1, &json!({ "error": format!("the job is no JSON: {e}") })),
-                Ok(job) if job.get("do").is_some_and(|what| what == "status") => {
-                    let status = serde_json::to_value(self.status_body(4)).unwrap_or_default();
-                    self.reply(&stamp, 0, &json!({ "ok": status }));
-                }
-                Ok(job) => {
-                    if let Err((code, text)) = self.begin(&job, stamp, deadline_ns) {
-                        self.reply(&stamp, code, &json!({ "error": text }));
-                    }
-                }
-            }
-        }
-        count == TAKE_JOBS
-    }
-
-    fn begin(&mut self, job: &Value, stamp: Stamp, deadline_ns: u64) -> Result<(), (u32, String)> {
-        let ask = Ask::from_json(job).map_err(|e| {
-            let code = if matches!(e, super::ask::AskError::Unknown(_)) { 3 } else { 1 };
-            (code, e.to_string())
-        })?;
-        let unit = job.get("unit").cloned().unwrap_or(Value::Null);
-        let unit = serde_json::from_value(unit)
-            .map_err(|_| (1, "the job lacks \"unit\" (a unit id or the name of a unit)".to_owned()))?;
-        let lines: Vec<LinePlan> = self.runners.iter().map(|r| r.plan.clone()).collect();
-        let has_own = self.config.serial.is_some() || self.config.tcp.is_some();
-        let (line, unit) = find_unit(&lines, &unit, has_own).map_err(|e| (1, e))?;
-        let id = self.next_job;
-        self.next_job += 1;
-        let core = &mut self.runners[line].line;
-        core.push_job(id, unit, ask.pdu(), deadline_ns, false).map_err(|e| (1, e.to_string()))?;
-        self.askers.insert(id, Asker { stamp, ask, line });
-        Ok(())
-    }
-
-    fn job_done(&mut self, id: u64, result: Result<Vec<u8>, Failure>) {
-        let Some(asker) = self.askers.remove(&id) else { return };
-        self.jobs_done += 1;
-        let runner = &self.runners[asker.line];
-        let outcome = match result {
-            Ok(pdu) => asker.ask.explain(&pdu),
-            Err(failure) => Err(match failure {
-                Failure::NoAnswer | Failure::UnitDown => format!(
-                    "no answer from {}: unit id, wiring, baud rate and parity are the usual causes",
-                    runner.plan.target
-                ),
-                Failure::Link => runner.trouble.clone().unwrap_or_else(|| "the line does not work".to_owned()),
-                Failure::Expired => "its turn did not come in time: the line is busy".to_owned(),
-                Failure::Mismatch => "the answer belongs to another request".to_owned(),
-            }),
-        };
-        match outcome {
-            Ok(value) => self.reply(&asker.stamp, 0, &json!({ "ok": value })),
-            Err(text) => {
-                self.jobs_failed += 1;
-                let code = if result_expired(&text) { 2 } else { 1 };
-                self.reply(&asker.stamp, code, &json!({ "error": text }));
-            }
-        }
-    }
-
-    fn reply(&mut self, job: &Stamp, code: u32, body: &Value) {
-        let header = JobResult {
-            job_seq: job.seq,
-            job_writer: job.writer,
-            job_generation: job.generation,
-            code,
-            ..JobResult::default()
-        };
-        let text = serde_json::to_vec(body).unwrap_or_default();
-        let sent = if text.len() > self.results.max_tail() as usize {
-            let short = br#"{"error":"the answer is longer than 4096 bytes; ask for less at once"}"#;
-            self.results.send_tail(JobResult { code: 1, ..header }, short)
-        } else {
-            self.results.send_tail(header, &text)
-        };
-        if let Err(e) = sent {
-            tracing::warn!("an answer was not sent: {e}");
-        }
-        self.results.ring();
-    }
-
     /// `fresh`: news, so the plc is woken; otherwise a repetition.
     fn publish(&mut self, fresh: bool) {
         let Some(port) = &mut self.published else { return };
@@ -695,37 +556,6 @@ impl Service {
             self.status();
         }
     }
-
-    fn status(&mut self) {
-        if self.events_left_out > 0 {
-            let message = format!("{} more changes in the last second left out", self.events_left_out);
-            self.ctx.event(EventKind::InputQuality, Level::Warning, message, Value::Null);
-        }
-        (self.event_budget, self.events_left_out) = (EVENTS_A_SECOND, 0);
-        let body = self.status_body(STATUS_UNITS);
-        self.ctx.status(&body);
-    }
-
-    fn status_body(&self, units: usize) -> Status {
-        let mut left = units;
-        let lines = self.runners.iter().map(|runner| line_row(runner, &mut left)).collect();
-        let count = |quality| (0..self.reads.len()).filter(|&i| self.inputs.quality(i) == quality).count();
-        Status {
-            lines,
-            ranges: self.reads.len(),
-            good: count(Quality::Good),
-            stale: count(Quality::Stale),
-            no_data: count(Quality::NoData),
-            safe: self.safe.filter(|_| self.image.is_some()),
-            jobs: self.jobs_done,
-            jobs_failed: self.jobs_failed,
-            images_too_small: self.writes.outside(),
-        }
-    }
-}
-
-fn result_expired(text: &str) -> bool {
-    text.starts_with("its turn did not come")
 }
 
 fn set_write(runners: &mut [Runner], slots: &[(usize, usize)], i: usize, pdu: &[u8], now_ns: u64) {
@@ -756,39 +586,12 @@ fn batch_done(batch: &Batch, result: Result<&[u8], Failure>, inputs: &mut InputT
     false
 }
 
-fn line_row(runner: &Runner, left: &mut usize) -> LineRow {
-    let mut units = Vec::new();
-    for view in runner.line.units() {
-        if *left == 0 {
-            break;
-        }
-        *left -= 1;
-        units.push(UnitRow {
-            unit: view.unit,
-            name: runner.plan.units.iter().find(|u| u.unit == view.unit).and_then(|u| u.name.clone()),
-            state: view.state,
-            counters: view.counters,
-            last_exception: view.last_exception.map(|code| exception_words(code, 0)),
-            rtt_us: view.last_rtt_ns.map(|ns| ns / 1000),
-            max_rtt_us: view.max_rtt_ns / 1000,
-        });
-    }
-    LineRow {
-        target: runner.plan.target.to_string(),
-        connected: matches!(runner.transport, Transport::Tcp(_)).then_some(runner.connected),
-        trouble: runner.trouble.clone(),
-        counters: runner.line.counters(),
-        jobs_waiting: runner.line.jobs(),
-        units,
-    }
-}
-
 fn runner(
     ctx: &mut Context,
     config: &Config,
     i: usize,
     plan: LinePlan,
-    reports: &mpsc::UnboundedSender<(usize, Report)>,
+    reports: &Reports,
 ) -> Result<Runner, RunError> {
     let turnaround_ns = config.turnaround.ns();
     let (settings, transport) = match &plan.target {
@@ -837,4 +640,3 @@ fn runner(
     }
     Ok(Runner { plan, line, transport, uses, batch_slots, dead: Vec::new(), trouble: None, connected: false })
 }
-

@@ -148,7 +148,10 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
     if config.plc.is_none() && plc.is_none() && !(config.reads.is_empty() && config.writes.is_empty()) {
         let count = stack.services.iter().filter(|s| s.kind == "plc").count();
         let (message, help) = if count == 0 {
-            ("the stack has no plc service", "add a [[service]] with kind = \"plc\"; it works without a program too")
+            (
+                "the stack has no plc service",
+                "add a [[service]] with kind = \"plc\"; it works without a program too",
+            )
         } else {
             ("the stack has several plc services", "say which one: plc = \"NAME\"")
         };

@@ -40,7 +40,11 @@ fn demo() -> Value {
 fn wiring() {
     let neighbours = Neighbours {
         name: "meters".into(),
-        services: vec![("com1".into(), "serial".into()), ("meters".into(), "modbus-client".into()), ("plc".into(), "plc".into())],
+        services: vec![
+            ("com1".into(), "serial".into()),
+            ("meters".into(), "modbus-client".into()),
+            ("plc".into(), "plc".into()),
+        ],
         dir: ".".into(),
         ..Neighbours::default()
     };

@@ -4,7 +4,7 @@
 //! else goes to the unit. A write to the unit takes its ranges out of the cache until they were read again after it.
 
 use crate::client::image::read_request;
-use crate::protocol::pdu::{bytes_for_bits, EXCEPTION_BIT};
+use crate::protocol::pdu::{EXCEPTION_BIT, bytes_for_bits};
 use crate::server::Table;
 
 /// A polled range.
@@ -59,9 +59,8 @@ impl Cache {
         let entry = self.entries.iter_mut().find(|e| e.range.line == line && e.slot == Some(slot));
         let Some(entry) = entry else { return };
         // One request is in flight at a time: a poll that began before a write ended ends before it.
-        let good = answer.filter(|a| {
-            a[0] & EXCEPTION_BIT == 0 && a.len() == entry.data.len() + 2 && entry.writes == 0
-        });
+        let good = answer
+            .filter(|a| a[0] & EXCEPTION_BIT == 0 && a.len() == entry.data.len() + 2 && entry.writes == 0);
         match good {
             Some(answer) => {
                 entry.data.copy_from_slice(&answer[2..]);

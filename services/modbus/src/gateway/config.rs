@@ -199,7 +199,11 @@ impl Config {
             plan.wrong("port", format!("more than {MAX_LINES} lines"), "use a second modbus-gateway");
         }
         if self.queue == 0 || self.queue as usize > MAX_JOBS {
-            plan.wrong("queue", format!("queue = {} is not 1 to {MAX_JOBS}", self.queue), "32 is the default");
+            plan.wrong(
+                "queue",
+                format!("queue = {} is not 1 to {MAX_JOBS}", self.queue),
+                "32 is the default",
+            );
         }
         if self.cache.len() > MAX_CACHE {
             plan.wrong("cache", format!("more than {MAX_CACHE} ranges"), "join ranges");
@@ -210,10 +214,15 @@ impl Config {
             }
         }
         if self.probe_max < self.probe_min {
-            plan.wrong("probe_max", "probe_max is shorter than probe_min", "exchange them, or leave them out");
+            plan.wrong(
+                "probe_max",
+                "probe_max is shorter than probe_min",
+                "exchange them, or leave them out",
+            );
         }
         if self.tcp.max_connections == 0 || self.tcp.max_connections > crate::config::MAX_CONNECTIONS {
-            let message = format!("{} is not 1 to {}", self.tcp.max_connections, crate::config::MAX_CONNECTIONS);
+            let message =
+                format!("{} is not 1 to {}", self.tcp.max_connections, crate::config::MAX_CONNECTIONS);
             plan.wrong("tcp.max_connections", message, "8 is the default");
         }
         if let Some((fault, help)) = self.tcp.filter.as_ref().and_then(|filter| filter.fault()) {
@@ -228,8 +237,11 @@ impl Config {
             probe_min_ns: self.probe_min.ns(),
             probe_max_ns: self.probe_max.ns(),
         };
-        let settings =
-            Settings { serial: true, turnaround_ns: Some(self.turnaround.ns()), send_limit_ns: SEND_LIMIT_NS };
+        let settings = Settings {
+            serial: true,
+            turnaround_ns: Some(self.turnaround.ns()),
+            send_limit_ns: SEND_LIMIT_NS,
+        };
         PortPlan {
             serial: serial.to_owned(),
             key: key.to_owned(),
@@ -250,7 +262,11 @@ impl Config {
                 Some(port) => format!("'{port}' is no line of the gateway"),
                 None => "there are several lines: which one?".to_owned(),
             };
-            plan.wrong(format!("units[{i}].port"), message, format!("set it to one of: {}", names.join(", ")));
+            plan.wrong(
+                format!("units[{i}].port"),
+                message,
+                format!("set it to one of: {}", names.join(", ")),
+            );
             return;
         };
         if let Some(other) = self.units[..i].iter().position(|other| other.tcp == unit.tcp) {
@@ -294,7 +310,9 @@ fn cached(i: usize, entry: &CacheEntry, plan: &mut Plan) {
             period_ns: entry.period.ns(),
             max_age_ns: entry.max_age.map_or(entry.period.ns().saturating_mul(3), |age| age.ns()),
         }),
-        _ => plan.wrong(format!("{key}.unit"), format!("unit {} is on no line", entry.unit), "map it in units"),
+        _ => {
+            plan.wrong(format!("{key}.unit"), format!("unit {} is on no line", entry.unit), "map it in units")
+        }
     }
 }
 
@@ -316,7 +334,10 @@ mod tests {
         }));
         assert_eq!(plan.mistakes, []);
         let routes = |unit: usize| plan.routes[unit];
-        assert_eq!((routes(1), routes(2), routes(255), routes(254)), (Some((1, 5)), Some((0, 2)), Some((0, 9)), None));
+        assert_eq!(
+            (routes(1), routes(2), routes(255), routes(254)),
+            (Some((1, 5)), Some((0, 2)), Some((0, 9)), None)
+        );
         assert!(plan.ports[1].ascii && plan.ports[1].setup.unit.response_timeout_ns == 300_000_000);
         let range = &plan.cache[0];
         assert_eq!((range.line, range.unit, range.max_age_ns), (1, 5, 3_000_000_000));
@@ -332,15 +353,23 @@ mod tests {
     fn mistakes_are_named() {
         let said = |value: Value| {
             let mistakes = plan(value).mistakes;
-            mistakes.iter().map(|m| format!("{}: {} -> {}", m.key, m.message, m.help)).collect::<Vec<_>>().join("\n")
+            mistakes
+                .iter()
+                .map(|m| format!("{}: {} -> {}", m.key, m.message, m.help))
+                .collect::<Vec<_>>()
+                .join("\n")
         };
         let all = [
             said(json!({})),
             said(json!({ "serial": "com1", "queue": 65, "response_timeout": "1us", "probe_max": "1ms" })),
             said(json!({ "serial": "com1", "tcp": { "max_connections": 0 } })),
             said(json!({ "serial": "com1", "port": [{ "serial": "com1" }] })),
-            said(json!({ "port": [{ "serial": "com1" }, { "serial": "com2" }], "units": [{ "tcp": 1 }, { "tcp": 2, "port": "com3" }] })),
-            said(json!({ "serial": "com1", "units": [{ "tcp": 1 }, { "tcp": 1, "line": 2 }, { "tcp": 255 }] })),
+            said(
+                json!({ "port": [{ "serial": "com1" }, { "serial": "com2" }], "units": [{ "tcp": 1 }, { "tcp": 2, "port": "com3" }] }),
+            ),
+            said(
+                json!({ "serial": "com1", "units": [{ "tcp": 1 }, { "tcp": 1, "line": 2 }, { "tcp": 255 }] }),
+            ),
             said(json!({ "serial": "com1", "cache": [
                 { "unit": 1, "table": "coils", "at": 0, "count": 2001 }, { "unit": 1, "table": "holding", "at": 65535, "count": 2 },
                 { "unit": 250, "table": "holding", "at": 0, "count": 2 }] })),

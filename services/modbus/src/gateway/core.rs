@@ -154,7 +154,14 @@ impl Core {
 
     /// A request of a master. `Some`: the answer is known at once. `None`: it comes by [`Core::step`] of the line,
     /// or never (a broadcast).
-    pub fn request(&mut self, client: u64, transaction: u16, unit: u8, pdu: &[u8], now_ns: u64) -> Option<&[u8]> {
+    pub fn request(
+        &mut self,
+        client: u64,
+        transaction: u16,
+        unit: u8,
+        pdu: &[u8],
+        now_ns: u64,
+    ) -> Option<&[u8]> {
         self.counters.requests += 1;
         let function = pdu.first().copied().unwrap_or(0) & !EXCEPTION_BIT;
         if pdu.is_empty() || pdu.len() > MAX_PDU {

@@ -45,7 +45,8 @@ const READ: [u8; 5] = [3, 0, 0, 0, 1];
 fn requests_go_through_unchanged() {
     let mut core = core(RULES, &[]);
     // A function that the gateway knows nothing of, and its exception.
-    for (request, answer) in [(&READ[..], &[3, 2, 1, 2][..]), (&[100, 1, 2], &[100, 9]), (&READ, &[0x83, 4])] {
+    for (request, answer) in [(&READ[..], &[3, 2, 1, 2][..]), (&[100, 1, 2], &[100, 9]), (&READ, &[0x83, 4])]
+    {
         assert_eq!(core.request(7, 0x1234, 5, request, 0), None);
         assert_eq!(steps(&mut core, 0, 0), [format!("send 5 {request:02X?}")]);
         core.sent(0, MS);

@@ -198,7 +198,10 @@ impl Shared {
             shared.serve(&client).await;
             shared.clients.borrow_mut().retain(|other| !Rc::ptr_eq(other, &client));
             shared.core.borrow_mut().client_gone(client.id);
-            shared.event(Level::Info, format!("Modbus master {peer} left after {} requests", client.requests.get()));
+            shared.event(
+                Level::Info,
+                format!("Modbus master {peer} left after {} requests", client.requests.get()),
+            );
         });
     }
 
@@ -240,7 +243,9 @@ impl Shared {
             match client.stream.try_read(&mut buffer[filled..]) {
                 Ok(0) => return,
                 Ok(n) => filled += n,
-                Err(e) if matches!(e.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted) => continue,
+                Err(e) if matches!(e.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted) => {
+                    continue;
+                }
                 Err(_) => return,
             }
             let Some(used) = self.requests(client, &buffer[..filled]) else { return };
@@ -541,7 +546,9 @@ impl Service {
                 accepted: self.shared.accepted.get(),
                 refused: self.shared.refused.get(),
                 counters: core.counters(),
-                lines: (0..self.names.len()).map(|line| line_row(&core, line, &self.names[line], &mut left)).collect(),
+                lines: (0..self.names.len())
+                    .map(|line| line_row(&core, line, &self.names[line], &mut left))
+                    .collect(),
             }
         };
         self.ctx.status(&status);
@@ -562,5 +569,10 @@ fn line_row(core: &Core, line: usize, name: &str, left: &mut usize) -> LineRow {
         })
         .collect();
     *left -= units.len();
-    LineRow { serial: name.to_owned(), waiting: core.waiting(line), counters: core.line_counters(line), units }
+    LineRow {
+        serial: name.to_owned(),
+        waiting: core.waiting(line),
+        counters: core.line_counters(line),
+        units,
+    }
 }

@@ -4,8 +4,8 @@
 //! [`decode`] reads one whole frame; [`Receiver`] finds frames in the characters of a line. A colon inside a frame
 //! begins a new one: whatever stood before it was cut off.
 
-pub use super::rtu::FrameError;
 use super::pdu::MAX_PDU;
+pub use super::rtu::FrameError;
 
 /// Longest frame: colon, 255 pairs (address, PDU, LRC), CR, LF (V1.02, 2.5.2.1).
 pub const MAX_ADU: usize = 513;
@@ -147,8 +147,7 @@ impl Receiver {
         };
         *slot = character;
         self.len += 1;
-        self.whole =
-            character == self.delimiter && self.bytes.get(self.len - 2) == Some(&b'\r');
+        self.whole = character == self.delimiter && self.bytes.get(self.len - 2) == Some(&b'\r');
         if self.whole { Received::Frame } else { Received::Nothing }
     }
 
@@ -238,7 +237,10 @@ mod tests {
         let mut receiver = Receiver::default();
         let (frames, broken) = receive(&mut receiver, b"x\r\n:01:0103FC\r\n\r\nyy:0203FB\r\n:0");
         assert_eq!(frames, [&b":0103FC\r\n"[..], b":0203FB\r\n"]);
-        assert_eq!((broken, receiver.is_inside(), receiver.reset(), receiver.reset()), (1, true, true, false));
+        assert_eq!(
+            (broken, receiver.is_inside(), receiver.reset(), receiver.reset()),
+            (1, true, true, false)
+        );
         let long = [&b":"[..], &[b'0'; 513]].concat();
         assert_eq!(receive(&mut receiver, &long), (vec![], 1));
         receiver.set_delimiter(b'!');

@@ -143,7 +143,8 @@ impl<'a> Iterator for AnsweredGroups<'a> {
         let group = rest.get(..usize::from(len))?;
         self.rest = rest.get(usize::from(len)..)?;
         let (&reference, values) = group.split_first()?;
-        (reference == REFERENCE_TYPE && !values.is_empty() && values.len().is_multiple_of(2)).then_some(values)
+        (reference == REFERENCE_TYPE && !values.is_empty() && values.len().is_multiple_of(2))
+            .then_some(values)
     }
 }
 

@@ -8,10 +8,10 @@
 //! (20 December 2006), cited as V1.02.
 
 pub mod ascii;
+pub mod client_fit;
 pub mod diagnostics;
 pub mod files;
 pub mod identification;
-pub mod client_fit;
 pub mod mbap;
 pub mod pdu;
 mod reply;

@@ -210,10 +210,22 @@ fn responses_that_are_not_the_answer() {
         (write, "06 0001 0003", ResponseError::Echo { function: 6 }),
         (write, "06 0001 0002 00", ResponseError::Length { function: 6 }),
         (Request::ReadExceptionStatus, "07", ResponseError::Length { function: 7 }),
-        (Request::Diagnostics { sub_function: 0, data: &[1, 2] }, "08 0000 0103", ResponseError::Echo { function: 8 }),
-        (Request::Diagnostics { sub_function: 11, data: &[0, 0] }, "08 000C 0103", ResponseError::Echo { function: 8 }),
+        (
+            Request::Diagnostics { sub_function: 0, data: &[1, 2] },
+            "08 0000 0103",
+            ResponseError::Echo { function: 8 },
+        ),
+        (
+            Request::Diagnostics { sub_function: 11, data: &[0, 0] },
+            "08 000C 0103",
+            ResponseError::Echo { function: 8 },
+        ),
         (Request::GetCommEventLog, "0C 05 0000 0000 00", ResponseError::Length { function: 12 }),
-        (Request::ReadFifoQueue { address: 0 }, "18 0006 0001 0000 0000", ResponseError::Length { function: 24 }),
+        (
+            Request::ReadFifoQueue { address: 0 },
+            "18 0006 0001 0000 0000",
+            ResponseError::Length { function: 24 },
+        ),
         (
             Request::ReadFileRecord { groups: &[6, 0, 1, 0, 0, 0, 2] },
             "14 04 03 06 1234",

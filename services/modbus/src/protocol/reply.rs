@@ -271,12 +271,10 @@ pub fn decode_response<'a>(request: &Request<'_>, pdu: &'a [u8]) -> Result<Respo
 }
 
 /// Responses to the functions beyond tables. `None`: the length does not fit.
-fn decode_special<'a>(
-    request: &Request<'_>,
-    data: &'a [u8],
-) -> Option<Result<Response<'a>, ResponseError>> {
+fn decode_special<'a>(request: &Request<'_>, data: &'a [u8]) -> Option<Result<Response<'a>, ResponseError>> {
     let function = request.function();
-    let all = |at: usize| data.get(at..).filter(|rest| data.get(at - 1) == u8::try_from(rest.len()).ok().as_ref());
+    let all =
+        |at: usize| data.get(at..).filter(|rest| data.get(at - 1) == u8::try_from(rest.len()).ok().as_ref());
     let response = match *request {
         Request::ReadExceptionStatus => match data {
             &[status] => Response::ReadExceptionStatus(status),

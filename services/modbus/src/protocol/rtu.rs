@@ -23,7 +23,9 @@ pub enum FrameError {
     #[error("{got} bytes are too many for a frame, which has at most {max}")]
     Long { got: usize, max: usize },
     /// RTU: the check at the end is another one than that of the bytes before it.
-    #[error("the CRC is {got:04X}h but that of the bytes is {expected:04X}h: the frame was damaged on the line")]
+    #[error(
+        "the CRC is {got:04X}h but that of the bytes is {expected:04X}h: the frame was damaged on the line"
+    )]
     Crc { got: u16, expected: u16 },
     /// ASCII: no colon at the beginning.
     #[error("the frame does not begin with ':'")]
@@ -35,7 +37,9 @@ pub enum FrameError {
     #[error("character {at} is no hexadecimal digit, or its pair is missing")]
     Digit { at: usize },
     /// ASCII: the check at the end is another one than that of the bytes before it.
-    #[error("the LRC is {got:02X}h but that of the bytes is {expected:02X}h: the frame was damaged on the line")]
+    #[error(
+        "the LRC is {got:02X}h but that of the bytes is {expected:02X}h: the frame was damaged on the line"
+    )]
     Lrc { got: u8, expected: u8 },
 }
 

@@ -151,15 +151,17 @@ fn check_lines(service: &str, config: &Config, stack: &Stack, findings: &mut Vec
             findings.push(Finding::error(service, &key("answer_within"), "no answer could be in time", help));
         }
         // "rtu" is what a serial service has without the key.
-        let framing = stack.service(&line.port).filter(|port| port.kind == "serial").map(|port| {
-            port.config.get("framing").and_then(|framing| framing.as_str()).unwrap_or("rtu")
-        });
+        let framing = stack
+            .service(&line.port)
+            .filter(|port| port.kind == "serial")
+            .map(|port| port.config.get("framing").and_then(|framing| framing.as_str()).unwrap_or("rtu"));
         let wanted = match line.mode {
             Mode::Rtu => "rtu",
             Mode::Ascii => "ascii",
         };
         if let Some(framing) = framing.filter(|framing| *framing != wanted) {
-            let message = format!("'{}' has framing = \"{framing}\", but {wanted} is served on it", line.port);
+            let message =
+                format!("'{}' has framing = \"{framing}\", but {wanted} is served on it", line.port);
             let help = format!("set framing = \"{wanted}\" in '{}', or another mode here", line.port);
             findings.push(Finding::error(service, &key("mode"), message, help));
         }
@@ -183,7 +185,8 @@ fn check_places(
     if let Some((byte, bytes)) = list
         && byte + bytes > sizes.input
     {
-        let message = format!("the list of clients reaches byte {} of %I, which has {}", byte + bytes, sizes.input);
+        let message =
+            format!("the list of clients reaches byte {} of %I, which has {}", byte + bytes, sizes.input);
         let help = "take an earlier place, lower max_connections, or raise input_bytes of the plc service";
         findings.push(Finding::error(service, "clients_to", message, help));
     }
@@ -223,4 +226,3 @@ fn check_watchdog(service: &str, config: &Config, addressing: Addressing, findin
         _ => {}
     }
 }
-

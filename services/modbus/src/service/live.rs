@@ -97,8 +97,10 @@ impl Port {
             let mut image = image.borrow_mut();
             image.begin();
             line.chunk(chunk, bytes, &mut *image, &mut |frame| {
-                let header =
-                    SerialChunk { first_t_ns: clock::mono_ns() + *answer_within_ns, ..SerialChunk::default() };
+                let header = SerialChunk {
+                    first_t_ns: clock::mono_ns() + *answer_within_ns,
+                    ..SerialChunk::default()
+                };
                 let queued = tx.send_tail(header, frame).is_ok();
                 sent |= queued;
                 queued
@@ -197,9 +199,7 @@ impl Live {
         let image = Rc::new(RefCell::new(build_image(ctx, &config, &plc)?));
         let shared = Shared {
             identity: Rc::new(config.identity.build().map_err(|e| wrong(e.to_string()))?),
-            rights: Rc::new(
-                Rights::new(&config.rights, &config.lines()).map_err(|e| wrong(e.to_string()))?,
-            ),
+            rights: Rc::new(Rights::new(&config.rights, &config.lines()).map_err(|e| wrong(e.to_string()))?),
             serial_codes_on_tcp: config.serial_codes_on_tcp,
         };
         let tcp = match config.tcp() {
@@ -415,8 +415,7 @@ fn build_image(ctx: &mut Context, config: &Config, plc: &str) -> Result<Served, 
     let wrong = |text: String| ServiceError::Config { service: service.clone(), text };
     let addressing = addressing_of(ctx.stack.service(plc));
     let maps: Result<Vec<_>, _> = config.maps().map(|map| map.build(AreaSizes::MAX, addressing)).collect();
-    let mut maps =
-        maps.map_err(|source| ServiceError::Map { service: service.clone(), source })?.into_iter();
+    let mut maps = maps.map_err(|source| ServiceError::Map { service: service.clone(), source })?.into_iter();
     let first = maps.next().ok_or_else(|| wrong("there is no map".to_owned()))?;
     let watchdog = match config.write_watchdog {
         None => None,

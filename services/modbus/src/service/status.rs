@@ -71,8 +71,7 @@ pub(super) fn body<'a>(
     rtu: &Listening,
     lines: &'a [LineStatus<'a>],
 ) -> StatusBody<'a> {
-    let mut client_list: Vec<ClientInfo> =
-        tcp.iter().chain(rtu).flat_map(|(hub, _)| hub.clients()).collect();
+    let mut client_list: Vec<ClientInfo> = tcp.iter().chain(rtu).flat_map(|(hub, _)| hub.clients()).collect();
     let clients = client_list.len();
     client_list.truncate(MAX_LISTED_CLIENTS);
     let newest = image.view().newest();

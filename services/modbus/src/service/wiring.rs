@@ -108,4 +108,3 @@ fn own_range(config: &Config, addressing: Addressing, byte: u32, bytes: u32) -> 
     );
     image_range(byte, bytes, label, key)
 }
-

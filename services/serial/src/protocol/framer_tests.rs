@@ -146,7 +146,7 @@ fn after_a_torn_frame_the_next_one_is_found() {
         line.turn(106 * MS);
         line.push(115 * MS, &request);
         line.turn(160 * MS);
-        assert_eq!(line.good(), [request.clone()], "grace {grace}");
+        assert_eq!(line.good(), std::slice::from_ref(&request), "grace {grace}");
         assert_eq!(line.seen[0].bytes, &request[..5]);
         let counters = line.framer.counters();
         assert_eq!((counters.frames, counters.crc_errors), (1, 1));

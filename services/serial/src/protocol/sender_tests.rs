@@ -194,7 +194,7 @@ proptest! {
     fn every_transmission_ends(n in 1usize..CHUNK_BYTES, room in 1usize..300, paced in any::<bool>(),
                                rts in prop::option::of((0..3 * MS, 0..3 * MS)), probes in 0u32..20,
                                deadline in prop_oneof![Just(0), 100 * MS..110 * MS], heard in 90 * MS..120 * MS) {
-        let mut sender = Sender::new(Settings { paced, rts, ..settings() });
+        let mut sender = Sender::new(Settings { rts, paced, ..settings() });
         let mut port = Port::new(100 * MS);
         port.room = room;
         port.probes_until_empty = probes;
