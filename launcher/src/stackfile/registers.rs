@@ -27,7 +27,8 @@ pub fn check(document: &Document, stack: &Stack, sink: &mut Sink<'_>) {
                 for (table, at) in map.entries_at(area, byte, bit) {
                     let index = tables.iter().position(|t| shows(t, table, at));
                     let Some(index) = index.filter(|i| !warned.contains(i)) else { continue };
-                    if map.check(Access::Write, table, at, 1).is_err() {
+                    let read_only = matches!(table, Table::DiscreteInputs | Table::InputRegisters);
+                    if read_only || map.check(Access::Write, table, at, 1).is_err() {
                         continue;
                     }
                     warned.push(index);

@@ -331,7 +331,7 @@ fn names_and_kinds() {
         ("bad stack name", stack("").replace("\"demo\"", "\"\"")),
         ("duplicate name", format!("{}{}", stack(""), service("io", "plc", ""))),
         ("unknown kind", stack("").replace("\"recorder\"", "\"recoder\"")),
-        ("kind to come", stack("").replace("\"recorder\"", "\"canopen-master\"")),
+        ("kind to come", stack("").replace("\"recorder\"", "\"j1939\"")),
         ("exec", stack("exec = [\"./mine\"]")),
     ];
     snapshot!("names_and_kinds", sentences(&cases));

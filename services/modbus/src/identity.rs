@@ -205,11 +205,10 @@ mod tests {
         }
     }
 
-    fn read(
-        identity: &Identity,
-        code: u8,
-        object: u8,
-    ) -> Result<(u8, bool, u8, Vec<(u8, String)>), Exception> {
+    /// Conformity, more, next, objects.
+    type Told = (u8, bool, u8, Vec<(u8, String)>);
+
+    fn read(identity: &Identity, code: u8, object: u8) -> Result<Told, Exception> {
         let mut out = [0; MAX_PDU];
         let len = identity.read(code, object, &mut out)?;
         let request = Request::ReadDeviceIdentification { code, object };

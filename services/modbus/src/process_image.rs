@@ -371,7 +371,9 @@ impl<R: Rail> Backend for ProcessImage<R> {
         let Self { rail, view, maps, buffers, .. } = self;
         rail.newest(&mut |header, tail| {
             if let Some(sizes) = view.take(header, tail) {
-                maps.iter_mut().for_each(|map| map.set_sizes(sizes));
+                for map in maps.iter_mut() {
+                    map.set_sizes(sizes);
+                }
                 buffers.set_sizes(sizes);
             }
         });

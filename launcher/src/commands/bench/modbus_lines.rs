@@ -1,6 +1,6 @@
 //! Serial lines: what the transparent gateway adds to the wire's time, cached reads, and how much of a line's budget
 //! the master uses. The line is a pseudo-terminal that the serial driver holds to the times of 115200 baud; the unit
-//! at its other end is a thread of the bench that answers at once.
+//! at its other end is a thread of the bench that answers after 3.5 characters of silence, as RTU demands.
 
 use super::modbus::Client;
 use super::stack::{BenchStack, free_port};
@@ -128,6 +128,8 @@ fn serve(mut port: Port, stop: &AtomicBool, answered: &AtomicU64) {
                 bytes.remove(0);
                 continue;
             };
+            // A unit knows the end of a request by the silence behind it.
+            silence();
             let mut pdu = vec![3, count * 2];
             pdu.resize(2 + usize::from(count) * 2, 0x11);
             bytes.drain(..8);
@@ -142,6 +144,15 @@ fn serve(mut port: Port, stop: &AtomicBool, answered: &AtomicU64) {
             }
             answered.fetch_add(1, Ordering::Relaxed);
         }
+    }
+}
+
+/// Waits for 3.5 characters, to the microsecond: a sleep alone takes longer by the time of the scheduler.
+fn silence() {
+    let end = Instant::now() + Duration::from_micros(T35_US as u64);
+    std::thread::sleep(Duration::from_micros(T35_US as u64 - 250));
+    while Instant::now() < end {
+        std::hint::spin_loop();
     }
 }
 

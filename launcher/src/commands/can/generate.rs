@@ -42,7 +42,7 @@ pub fn run(args: &GenArgs, json: bool) -> anyhow::Result<ExitCode> {
         why = sender.stalled();
         let early = due.saturating_sub(begin.elapsed());
         if gone == 0 && early > Duration::from_millis(2) {
-            std::thread::sleep(early.min(Duration::from_millis(50)) - Duration::from_millis(1));
+            std::thread::sleep(early.min(Duration::from_millis(50)).saturating_sub(Duration::from_millis(1)));
         } else {
             sender.rest(seen || gone > 0);
         }

@@ -1,14 +1,15 @@
 //! A page that is drawn again and again in its place.
 
-use std::io::Write;
+use std::io::{Stdout, Write};
 
 /// The terminal's second screen; left when dropped, whatever happens.
-pub struct Page(());
+pub struct Page(Stdout);
 
 impl Page {
     pub fn open() -> Self {
-        put("\x1b[?1049h\x1b[?25l\x1b[2J");
-        Self(())
+        let page = Self(std::io::stdout());
+        page.put("\x1b[?1049h\x1b[?25l\x1b[2J");
+        page
     }
 
     /// Shows these lines, as many as there is room for.
@@ -30,18 +31,18 @@ impl Page {
             text += &format!("\r\n... {more} lines more\x1b[K");
         }
         text.push_str("\x1b[J");
-        put(&text);
+        self.put(&text);
+    }
+
+    /// A terminal that is gone is no reason to fail: the command ends with its signal.
+    fn put(&self, text: &str) {
+        let mut out = self.0.lock();
+        let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
     }
 }
 
 impl Drop for Page {
     fn drop(&mut self) {
-        put("\x1b[?25h\x1b[?1049l");
+        self.put("\x1b[?25h\x1b[?1049l");
     }
-}
-
-/// A terminal that is gone is no reason to fail: the command ends with its signal.
-fn put(text: &str) {
-    let mut out = std::io::stdout().lock();
-    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
 }

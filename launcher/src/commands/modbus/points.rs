@@ -333,7 +333,7 @@ mod tests {
             "99999999",
             "0:float:AB",
             "00001:float",
-            "0x200",
+            "0x1FFFF",
             "40001:int16:AB:z",
             "0x",
             "65535x2",
@@ -341,7 +341,18 @@ mod tests {
         .iter()
         .map(|text| parse(text, &form(), 1).unwrap_err().0)
         .collect();
-        insta::assert_snapshot!(wrong.join("\n"), @"");
+        insta::assert_snapshot!(wrong.join("\n"), @r#"
+        'x' is no address: write 40001, 0 or 0x10
+        '20001': numbers begin with 0, 1, 3 or 4; with --table they count from 0
+        '40000': entries count from 1
+        '99999999': addresses end at 65535 (465536)
+        '0:float:AB': order AB is not for values of 2 registers
+        '00001:float': coils are bits
+        '0x1FFFF': addresses end at 65535 (465536)
+        '40001:int16:AB:z': what is ':z'?
+        '0x' is no address: write 40001, 0 or 0x10
+        '65535': numbers begin with 0, 1, 3 or 4; with --table they count from 0
+        "#);
     }
 
     #[test]

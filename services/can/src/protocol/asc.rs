@@ -215,7 +215,7 @@ impl Reader {
         let code = self.code(words.next().unwrap_or_default())?;
         let said = words.next().unwrap_or_default();
         let len = said.parse::<usize>().ok().filter(|len| *len <= 64);
-        let Some(len) = len else { return Err(self.length_mismatch(code, said)) };
+        let Some(len) = len else { return Err(Self::length_mismatch(code, said)) };
         let mut data = [0; 64];
         self.bytes(&mut words, &mut data[..len])?;
         let flags = words.nth(2).and_then(|word| u32::from_str_radix(word, 16).ok());
@@ -230,7 +230,7 @@ impl Reader {
                 }
             }
             _ if usize::from(FD_LENGTHS[usize::from(code & 0xF)]) != len => {
-                return Err(self.length_mismatch(code, said));
+                return Err(Self::length_mismatch(code, said));
             }
             _ => {
                 let fd = if brs { FD_BRS } else { 0 } | if esi { FD_ESI } else { 0 };
@@ -240,7 +240,7 @@ impl Reader {
         Ok(Some((frame, tx)))
     }
 
-    fn length_mismatch(&self, code: u8, said: &str) -> AscError {
+    fn length_mismatch(code: u8, said: &str) -> AscError {
         AscError::FdLength { code, by_code: FD_LENGTHS[usize::from(code & 0xF)], said: short(said) }
     }
 

@@ -2,7 +2,7 @@
 
 use super::value::{Number, ObjectRef};
 use ipc_types::units::Span;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, de};
 
 /// Most `[[service.node]]`: the node-ids of CiA 301 clause 7.2.3 less the master's own.
 pub const MAX_NODES: usize = 126;
@@ -101,11 +101,40 @@ pub enum SafeOn {
 }
 
 /// Safe state: `"zero"`, `"hold"`, `"preop"`, `"stop"`, or `{ values = [...] }`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged, expecting = "\"zero\", \"hold\", \"preop\", \"stop\" or { values = [...] }")]
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(untagged)]
 pub enum OnStop {
     Word(OnStopWord),
-    Values { values: Vec<StopValue> },
+    Values(StopValues),
+}
+
+impl<'de> Deserialize<'de> for OnStop {
+    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
+        struct Visit;
+        impl<'de> de::Visitor<'de> for Visit {
+            type Value = OnStop;
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("\"zero\", \"hold\", \"preop\", \"stop\" or { values = [...] }")
+            }
+            fn visit_str<E: de::Error>(self, text: &str) -> Result<OnStop, E> {
+                OnStopWord::deserialize(de::value::StrDeserializer::<E>::new(text))
+                    .map(OnStop::Word)
+                    .map_err(|_| E::invalid_value(de::Unexpected::Str(text), &self))
+            }
+            // A derived untagged enum would swallow which key of the table is unknown.
+            fn visit_map<A: de::MapAccess<'de>>(self, map: A) -> Result<OnStop, A::Error> {
+                StopValues::deserialize(de::value::MapAccessDeserializer::new(map)).map(OnStop::Values)
+            }
+        }
+        d.deserialize_any(Visit)
+    }
+}
+
+/// The table form of [`OnStop`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StopValues {
+    pub values: Vec<StopValue>,
 }
 
 impl Default for OnStop {

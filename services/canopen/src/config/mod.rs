@@ -6,7 +6,7 @@ mod value;
 
 pub use master::{
     Check, Config as MasterConfig, ErrorPolicy, Guarding, MAX_MAPS, MAX_NODES, MAX_SDO_WRITES, Map, Node,
-    OnBadWord, OnStop, OnStopWord, Pdo, Restore, SafeOn, SdoWrite, StopValue, Transmission,
+    OnBadWord, OnStop, OnStopWord, Pdo, Restore, SafeOn, SdoWrite, StopValue, StopValues, Transmission,
 };
 pub use slave::{Config as SlaveConfig, Map as SlaveMap, Simulation};
 pub use value::{Number, ObjectRef};

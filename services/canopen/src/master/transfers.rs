@@ -40,6 +40,8 @@ pub struct JobEnd {
     pub index: u16,
     pub sub: u8,
     pub direction: Direction,
+    /// Bytes transferred.
+    pub bytes: usize,
     /// Data read, empty after a write.
     pub result: Result<Vec<u8>, Failure>,
 }
@@ -49,7 +51,7 @@ struct Slot {
     node: u8,
     client: SdoClient,
     queue: VecDeque<Request>,
-    current: Option<Owner>,
+    current: Option<Request>,
 }
 
 /// See the module.
@@ -127,6 +129,11 @@ impl Transfers {
         }
         if request.owner == Owner::Boot {
             slot.queue.push_front(request);
+            // A job may take minutes, and the node stands still until it is booted: the job begins again afterwards.
+            if let Some(job) = slot.current.take_if(|r| r.owner != Owner::Boot) {
+                slot.client.cancel(Abort::LOCAL_CONTROL, out);
+                slot.queue.insert(1, job);
+            }
         } else {
             slot.queue.push_back(request);
         }
@@ -138,7 +145,7 @@ impl Transfers {
     pub fn cancel(&mut self, node: u8, owner: Owner) {
         let Some(slot) = self.slot(node) else { return };
         slot.queue.retain(|r| r.owner != owner);
-        if slot.current == Some(owner) {
+        if slot.current.as_ref().is_some_and(|r| r.owner == owner) {
             slot.client.reset();
             slot.current = None;
         }
@@ -154,14 +161,12 @@ impl Transfers {
             return;
         }
         let Some(request) = slot.queue.pop_front() else { return };
-        slot.current = Some(request.owner);
-        let Request { index, sub, data, options, .. } = request;
-        let (direction, started) = match data {
-            Some(data) => {
-                (Direction::Write, slot.client.start_write(now_ns, index, sub, &data, options, out))
-            }
+        let Request { index, sub, options, .. } = request;
+        let (direction, started) = match &request.data {
+            Some(data) => (Direction::Write, slot.client.start_write(now_ns, index, sub, data, options, out)),
             None => (Direction::Read, slot.client.start_read(now_ns, index, sub, options, out)),
         };
+        slot.current = Some(request);
         if started.is_err() {
             let failure = Failure { abort: Abort::MEMORY, by: crate::protocol::sdo::By::Client };
             self.ended(now_ns, node, Finished { index, sub, direction, result: Err(failure) }, out);
@@ -170,8 +175,9 @@ impl Transfers {
 
     fn ended(&mut self, now_ns: u64, node: u8, finished: Finished, out: &mut Outbox) {
         let Some(slot) = self.slot(node) else { return };
-        let owner = slot.current.take();
+        let owner = slot.current.take().map(|r| r.owner);
         let Finished { index, sub, direction, result } = finished;
+        let bytes = result.unwrap_or(0);
         let result = result.map(|n| match direction {
             Direction::Read => slot.client.data().get(..n).unwrap_or_default().to_vec(),
             Direction::Write => Vec::new(),
@@ -190,7 +196,7 @@ impl Transfers {
                 if self.job_ends.len() == MAX_ENDS {
                     self.job_ends.pop_front();
                 }
-                self.job_ends.push_back(JobEnd { job, node, index, sub, direction, result });
+                self.job_ends.push_back(JobEnd { job, node, index, sub, direction, bytes, result });
             }
             None => {}
         }
@@ -229,5 +235,66 @@ impl Transfers {
     /// The next transfer of a job that ended.
     pub fn take_job_end(&mut self) -> Option<JobEnd> {
         self.job_ends.pop_front()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::master::testing::dictionary;
+    use crate::protocol::od::NoHooks;
+    use crate::protocol::sdo::{SdoServer, ServerConfig};
+
+    #[test]
+    fn a_boot_up_goes_before_a_job_that_begins_again_afterwards() {
+        let mut od = dictionary(5);
+        let mut server = SdoServer::new(Channel::default_of(5), ServerConfig::default(), &od);
+        let mut transfers = Transfers::new([(5, 1_000_000)]);
+        let mut out = Outbox::default();
+        let job = |n| Request {
+            index: 0x2000,
+            sub: 0,
+            data: Some(vec![n, 0, 0, 0]),
+            owner: Owner::Job(u64::from(n)),
+            options: Options::default(),
+        };
+        assert!(transfers.ask(0, 5, job(1), &mut out) && transfers.ask(0, 5, job(2), &mut out));
+        transfers.read(1, 5, 0x1000, 0, Owner::Boot, &mut out);
+        let mut order = Vec::new();
+        for _ in 0..10 {
+            let mut answers = Outbox::default();
+            for frame in out.drain().collect::<Vec<_>>() {
+                server.on_frame(2, &frame, &mut od, &mut NoHooks, &mut answers);
+            }
+            for frame in answers.drain().collect::<Vec<_>>() {
+                transfers.on_frame(2, 5, &frame, &mut out);
+            }
+            while let Some((_, end)) = transfers.take_boot_end() {
+                assert!(matches!(end, SdoEnd::Read(_)), "{end:?}");
+                order.push(0);
+            }
+            while let Some(end) = transfers.take_job_end() {
+                assert_eq!(end.result, Ok(Vec::new()));
+                order.push(end.job);
+            }
+        }
+        assert_eq!(order, [0, 1, 2]);
+    }
+
+    #[test]
+    fn a_full_queue_refuses_jobs_and_never_a_boot_up() {
+        let mut transfers = Transfers::new([(5, 1_000_000)]);
+        let mut out = Outbox::default();
+        let job = |n| Request {
+            index: 0x2000,
+            sub: 0,
+            data: None,
+            owner: Owner::Job(n),
+            options: Options::default(),
+        };
+        let taken = (0..100).filter(|&n| transfers.ask(0, 5, job(n), &mut out)).count();
+        assert_eq!((taken, transfers.refused), (MAX_QUEUE + 1, 99 - MAX_QUEUE as u64));
+        assert!(transfers.ask(0, 5, Request { owner: Owner::Boot, ..job(0) }, &mut out));
+        assert!(!transfers.ask(0, 6, job(0), &mut out));
     }
 }

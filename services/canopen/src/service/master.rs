@@ -1,6 +1,6 @@
 //! The service `canopen-master`: rail ports, clocks, the loop.
 
-use super::jobs::{self, FAILED, MAX_FILE, MAX_INLINE, Request};
+use super::jobs::{self, FAILED, MAX_FILE, MAX_INLINE, Request, Transfer};
 use super::outputs::{Unsafe, gather, judge, values};
 use super::{
     BEAT, EVENTS_A_SECOND, REPEAT_NS, RunError, STATUS_BEATS, TAKE_FRAMES, addressing_near, load,
@@ -11,12 +11,12 @@ use crate::device::Device;
 use crate::master::exchange::Exchange;
 use crate::master::network::{Event, Network, NodeRun, state_name};
 use crate::master::plan::{Plan, encode, plan};
-use crate::master::transfers::{JobEnd, Owner, Request as Transfer, Transfers};
+use crate::master::transfers::{JobEnd, Owner, Request as Wanted, Transfers};
 use crate::protocol::cob_id::predefined;
 use crate::protocol::data_type::DataType;
 use crate::protocol::io::Outbox;
 use crate::protocol::nmt::NmtCommand;
-use crate::protocol::sdo::{Direction, Options};
+use crate::protocol::sdo::{Direction, Mode, Options};
 use crate::protocol::time_stamp::TimeOfDay;
 use ipc_types::event::{EventKind, Level};
 use ipc_types::inbox::Inbox;
@@ -36,6 +36,8 @@ const MAX_WAITING: usize = 1024;
 const RETRY_NS: u64 = 1_000_000;
 /// Jobs under way; more are refused.
 const MAX_JOBS: usize = 64;
+/// Values of up to so many bytes are not worth a block transfer (protocol switch threshold).
+const SHORT: u8 = 21;
 /// Jobs taken from the rail before other work has its turn.
 const TAKE_JOBS: usize = 16;
 
@@ -102,7 +104,7 @@ fn safe_values(config: &Config, outputs: &[ImageRange]) -> Result<Option<Vec<u8>
     let named = match &config.on_stop {
         OnStop::Word(OnStopWord::Hold) => return Ok(None),
         OnStop::Word(OnStopWord::Zero | OnStopWord::Preop | OnStopWord::Stop) => &[][..],
-        OnStop::Values { values } => values,
+        OnStop::Values(table) => &table.values,
     };
     let sources: Vec<(&str, &str)> = config
         .nodes
@@ -545,7 +547,7 @@ impl Service {
             }
             Request::SdoRead { node, object, mode, file } => {
                 let (index, sub) = self.object(node, &object).map_err(fail)?;
-                let options = Options { mode: mode.mode(), ..Options::default() };
+                let options = self.read_options(node, (index, sub), mode);
                 self.transfer(now_ns, node, (index, sub), None, options, Asked { seq, file, ..*by })
             }
             Request::SdoWrite { node, object, data, value, file, mode } => {
@@ -575,6 +577,17 @@ impl Service {
             (None, None) => {
                 Err(format!("node {node} has no EDS that names objects; write the number of '{object}'"))
             }
+        }
+    }
+
+    /// Long values are read by block, where the EDS says that the value may be long: asking every device for block
+    /// transfer of four bytes would cost the others an abort.
+    fn read_options(&self, node: u8, (index, sub): (u16, u8), mode: Transfer) -> Options {
+        let entry = self.devices.get(&node).and_then(|d| d.od.entry(d.od.find(index, sub).ok()?));
+        let long = entry.is_some_and(|e| e.data_type.size().is_none());
+        match mode {
+            Transfer::Auto if long => Options { mode: Mode::Block, threshold: SHORT, ..Options::default() },
+            _ => Options { mode: mode.mode(), ..Options::default() },
         }
     }
 
@@ -625,7 +638,7 @@ impl Service {
         }
         self.network.transfers.add(node, self.config.sdo_timeout.ns());
         self.next_job += 1;
-        let request = Transfer { index, sub, data, owner: Owner::Job(self.next_job), options };
+        let request = Wanted { index, sub, data, owner: Owner::Job(self.next_job), options };
         if !self.network.transfers.ask(now_ns, node, request, &mut self.out) {
             return Err((FAILED, format!("too many transfers wait for node {node} already; try again")));
         }
@@ -654,7 +667,7 @@ impl Service {
                 );
             }
         };
-        let mut value = json!({ "object": object, "bytes": data.len() });
+        let mut value = json!({ "object": object, "bytes": end.bytes });
         if end.direction == Direction::Write {
             return Ok(value);
         }

@@ -100,7 +100,7 @@ fn bytes(hex: &str) -> Vec<u8> {
 }
 
 fn hex(data: &[u8]) -> String {
-    data.iter().map(|byte| format!("{byte:02X}")).collect()
+    data.iter().fold(String::new(), |text, byte| text + &format!("{byte:02X}"))
 }
 
 fn abort_code(data: &[u8]) -> Option<u32> {
@@ -189,7 +189,8 @@ impl<'a> Run<'a> {
     /// The log is about to wait for a frame. If a heartbeat of another node comes later in it, that node goes on with its
     /// period meanwhile.
     fn beat_while_waiting(&mut self, case: &Case, at: usize, id: u32, data: &[u8]) {
-        if self.device.sent.iter().any(|sent| sent.id == id && sent.data == data) || self.sent_early.is_some() {
+        if self.device.sent.iter().any(|sent| sent.id == id && sent.data == data) || self.sent_early.is_some()
+        {
             return;
         }
         let Some(beat) = self.beat_ns else { return };
@@ -204,7 +205,9 @@ impl<'a> Run<'a> {
         let next = rest().take_while(|(_, step)| !stop(step)).find(|(_, step)| other(step));
         if let Some((next, step)) = next {
             let due = beat + HEARTBEAT_MS * MS;
-            while self.device.t_ns < due && !self.device.sent.iter().any(|sent| sent.id == id && sent.data == data) {
+            while self.device.t_ns < due
+                && !self.device.sent.iter().any(|sent| sent.id == id && sent.data == data)
+            {
                 self.device.wait_ms(1);
             }
             if self.device.t_ns >= due {

@@ -21,7 +21,8 @@ mod types;
 
 use types::Pdu;
 pub use types::{
-    Failure, LineCounters, Origin, QueueFull, Settings, SlotKind, Step, UnitCounters, UnitSettings, UnitState, UnitView,
+    Failure, LineCounters, Origin, QueueFull, Settings, SlotKind, Step, UnitCounters, UnitSettings,
+    UnitState, UnitView,
 };
 
 /// Most jobs that wait for a line.

@@ -53,12 +53,7 @@ pub struct Link {
 
 impl Link {
     /// Starts the task; its reports come with the number `line`.
-    pub fn start(
-        line: usize,
-        target: &Target,
-        connect_timeout: Duration,
-        reports: Reports,
-    ) -> Option<Self> {
+    pub fn start(line: usize, target: &Target, connect_timeout: Duration, reports: Reports) -> Option<Self> {
         // One request is in flight, so a queue never holds more than an order to send and one to drop.
         let (orders, inbox) = mpsc::unbounded_channel();
         let task = Task { line, seq: 0, orders: inbox, reports, connect_timeout };
@@ -161,7 +156,9 @@ impl Task {
                 }
                 // Requests go out as bytes ("custom"), answers come back by their meaning, which tokio-modbus takes
                 // for another function. Whether it is, the line sees: it compares the bytes.
-                Err(tokio_modbus::Error::Protocol(ProtocolError::FunctionCodeMismatch { result, .. })) => {
+                Err(tokio_modbus::Error::Protocol(ProtocolError::FunctionCodeMismatch {
+                    result, ..
+                })) => {
                     let pdu = match result {
                         Ok(response) => response_pdu(&response),
                         Err(e) => vec![e.function.value() | EXCEPTION_BIT, u8::from(e.exception)],

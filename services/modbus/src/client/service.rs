@@ -10,9 +10,7 @@ use self::jobs::Asker;
 use super::alarm::Alarm;
 use super::config::{Config, MAX_READS, SafeOn};
 use super::image::{InputTable, WriteTable, read_request};
-use super::line::{
-    Failure, Line, Origin, Settings, SlotKind, Step, UnitSettings, UnitState,
-};
+use super::line::{Failure, Line, Origin, Settings, SlotKind, Step, UnitSettings, UnitState};
 use super::link::{Link, Report, Reports};
 use super::plan::{Batch, LinePlan, Plan, Target, plan};
 use super::port::{Incoming, SEND_LIMIT_NS, SerialPort};

@@ -366,7 +366,9 @@ impl Live {
         let mut news = false;
         for hub in self.hubs() {
             let (happenings, left_out) = hub.take_happenings();
-            happenings.iter().for_each(|happening| tell_client(happening, ctx));
+            for happening in &happenings {
+                tell_client(happening, ctx);
+            }
             if left_out > 0 {
                 let message = format!("{left_out} more connections came, went or were refused");
                 ctx.event(EventKind::Client, Level::Warning, message, Value::Null);
@@ -431,10 +433,8 @@ fn build_image(ctx: &mut Context, config: &Config, plc: &str) -> Result<Served, 
     let list = config.client_list(addressing).map_err(|e| wrong(e.to_string()))?;
     let status = config.exception_bits(addressing).map_err(|e| wrong(e.to_string()))?;
     let owns = ctx.entry().is_some_and(|entry| !entry.wiring.inputs.is_empty());
-    let inputs = match owns {
-        false => None,
-        true => Some(ctx.publisher(&TopicKind::Inputs.of(&service)).map_err(rail)?),
-    };
+    let inputs =
+        if owns { Some(ctx.publisher(&TopicKind::Inputs.of(&service)).map_err(rail)?) } else { None };
     let ports = Ports {
         image: ctx.subscriber(&TopicKind::Image.of(plc)).map_err(rail)?,
         writes: ctx.publisher(&TopicKind::Writes.of(plc)).map_err(rail)?,

@@ -99,7 +99,7 @@ pub enum GuardEvent {
 #[derive(Debug, Clone)]
 pub struct Guard {
     node_id: u8,
-    guard_ns: u64,
+    period_ns: u64,
     life_ns: u64,
     next_ns: u64,
     deadline_ns: u64,
@@ -111,11 +111,11 @@ pub struct Guard {
 impl Guard {
     /// Asks at once and then every guard time. A guard time of 0 counts as 1 ms, a factor of 0 as 1.
     pub fn new(t_ns: u64, node_id: u8, guard_time_ms: u16, life_time_factor: u8) -> Self {
-        let guard_ns = u64::from(guard_time_ms.max(1)) * MS;
-        let life_ns = guard_ns * u64::from(life_time_factor.max(1));
+        let period_ns = u64::from(guard_time_ms.max(1)) * MS;
+        let life_ns = period_ns * u64::from(life_time_factor.max(1));
         Self {
             node_id,
-            guard_ns,
+            period_ns,
             life_ns,
             next_ns: t_ns,
             deadline_ns: t_ns.saturating_add(life_ns),
@@ -162,8 +162,8 @@ impl Guard {
     pub fn on_time(&mut self, t_ns: u64, out: &mut Outbox) -> Option<GuardEvent> {
         if t_ns >= self.next_ns {
             out.push(cob(self.node_id).remote(1));
-            let grid = self.next_ns.saturating_add(self.guard_ns);
-            self.next_ns = if grid > t_ns { grid } else { t_ns.saturating_add(self.guard_ns) };
+            let grid = self.next_ns.saturating_add(self.period_ns);
+            self.next_ns = if grid > t_ns { grid } else { t_ns.saturating_add(self.period_ns) };
         }
         if self.lost || t_ns < self.deadline_ns {
             return None;

@@ -252,7 +252,7 @@ mod tests {
     fn all_127_entries_work_and_unused_values_are_ignored() {
         let mut consumer = HeartbeatConsumer::default();
         for node_id in 1..=127u8 {
-            consumer.configure(node_id, u32::from(node_id) << 16 | 10);
+            consumer.configure(node_id, u32::from(node_id) << 16 | 0xA);
         }
         for node_id in 1..=127u8 {
             assert!(

@@ -84,13 +84,6 @@ impl LssSlave {
     pub fn node_id_taken(&mut self) {
         self.active_node_id = self.pending_node_id;
     }
-    fn answer(&self, cs: u8, rest: [u8; 7], out: &mut Outbox) {
-        out.push(frame(predefined::LSS_SLAVE, cs, rest));
-    }
-    fn answer_u32(&self, cs: u8, value: u32, out: &mut Outbox) {
-        let [a, b, c, d] = value.to_le_bytes();
-        self.answer(cs, [a, b, c, d, 0, 0, 0], out);
-    }
     fn enter(&mut self, state: LssState) -> Option<LssSlaveEvent> {
         self.selected = 0;
         let from = std::mem::replace(&mut self.state, state);
@@ -121,7 +114,7 @@ impl LssSlave {
             cs::IDENTIFY_NON_CONFIGURED => {
                 // Answered by devices without node-id, neither active nor pending (5.7.2).
                 if self.active_node_id == UNCONFIGURED && self.pending_node_id == UNCONFIGURED {
-                    self.answer(cs::NON_CONFIGURED_ANSWER, [0; 7], out);
+                    answer(cs::NON_CONFIGURED_ANSWER, [0; 7], out);
                 }
                 None
             }
@@ -148,7 +141,7 @@ impl LssSlave {
             return None;
         }
         let event = self.enter(LssState::Configuration);
-        self.answer(cs::SWITCH_SELECTIVE_ANSWER, [0; 7], out);
+        answer(cs::SWITCH_SELECTIVE_ANSWER, [0; 7], out);
         event
     }
     /// Vendor and product exactly, revision and serial within a range (5.7.1).
@@ -170,7 +163,7 @@ impl LssSlave {
         };
         if self.identified == 6 {
             self.identified = 0;
-            self.answer(cs::IDENTIFY_ANSWER, [0; 7], out);
+            answer(cs::IDENTIFY_ANSWER, [0; 7], out);
         }
     }
     /// Takes part while without node-id and waiting (5.7.3). Bytes: IDNumber, BitCheck, LSSSub, LSSNext.
@@ -184,7 +177,7 @@ impl LssSlave {
         let (bit_check, sub, next) = (data[5], data[6], data[7]);
         if bit_check == 0x80 {
             self.fastscan_at = 0;
-            self.answer(cs::IDENTIFY_ANSWER, [0; 7], out);
+            answer(cs::IDENTIFY_ANSWER, [0; 7], out);
             return None;
         }
         if bit_check > 31 || sub > 3 || next > 3 || sub != self.fastscan_at {
@@ -202,7 +195,7 @@ impl LssSlave {
                 event = self.enter(LssState::Configuration);
             }
         }
-        self.answer(cs::IDENTIFY_ANSWER, [0; 7], out);
+        answer(cs::IDENTIFY_ANSWER, [0; 7], out);
         event
     }
     fn configure(&mut self, data: &[u8; 8], out: &mut Outbox) -> Option<LssSlaveEvent> {
@@ -214,7 +207,7 @@ impl LssSlave {
                 if right {
                     self.pending_node_id = data[1];
                 }
-                self.answer(cs::CONFIGURE_NODE_ID, [u8::from(!right), 0, 0, 0, 0, 0, 0], out);
+                answer(cs::CONFIGURE_NODE_ID, [u8::from(!right), 0, 0, 0, 0, 0, 0], out);
                 right.then_some(LssSlaveEvent::NodeIdPending { node_id: data[1] })
             }
             cs::CONFIGURE_BIT_TIMING => {
@@ -226,7 +219,7 @@ impl LssSlave {
                 if right {
                     self.pending_kbit = kbit;
                 }
-                self.answer(cs::CONFIGURE_BIT_TIMING, [u8::from(!right), 0, 0, 0, 0, 0, 0], out);
+                answer(cs::CONFIGURE_BIT_TIMING, [u8::from(!right), 0, 0, 0, 0, 0, 0], out);
                 right.then_some(LssSlaveEvent::BitTimingPending { kbit })
             }
             cs::ACTIVATE_BIT_TIMING => {
@@ -236,20 +229,29 @@ impl LssSlave {
             }
             cs::STORE => {
                 // 5.4.4: error code 1 = storing not supported.
-                self.answer(cs::STORE, [u8::from(!self.abilities.store), 0, 0, 0, 0, 0, 0], out);
+                answer(cs::STORE, [u8::from(!self.abilities.store), 0, 0, 0, 0, 0, 0], out);
                 let (node_id, kbit) = (self.pending_node_id, self.pending_kbit);
                 self.abilities.store.then_some(LssSlaveEvent::Store { node_id, kbit })
             }
             cs @ cs::INQUIRE_VENDOR..=cs::INQUIRE_SERIAL => {
                 let part = own.parts()[usize::from(cs - cs::INQUIRE_VENDOR)];
-                self.answer_u32(cs, part, out);
+                answer_u32(cs, part, out);
                 None
             }
             cs::INQUIRE_NODE_ID => {
-                self.answer(cs::INQUIRE_NODE_ID, [self.active_node_id, 0, 0, 0, 0, 0, 0], out);
+                answer(cs::INQUIRE_NODE_ID, [self.active_node_id, 0, 0, 0, 0, 0, 0], out);
                 None
             }
             _ => None,
         }
     }
+}
+
+fn answer(cs: u8, rest: [u8; 7], out: &mut Outbox) {
+    out.push(frame(predefined::LSS_SLAVE, cs, rest));
+}
+
+fn answer_u32(cs: u8, value: u32, out: &mut Outbox) {
+    let [a, b, c, d] = value.to_le_bytes();
+    answer(cs, [a, b, c, d, 0, 0, 0], out);
 }

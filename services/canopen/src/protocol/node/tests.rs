@@ -40,8 +40,8 @@ fn builder() -> OdBuilder {
             od.array(mapping, 64, u32_of(0));
             let subs = &mut od.object_mut(mapping).unwrap().subs;
             subs[0].1 = number(Unsigned8).value(2);
-            for at in 1..=2 {
-                subs[at].1 = u32_of(i64::from(object | (u32::from(n) * 2 + at as u32) << 8));
+            for (at, (_, def)) in subs.iter_mut().enumerate().skip(1).take(2) {
+                *def = u32_of(i64::from(object | (u32::from(n) * 2 + at as u32) << 8));
             }
         }
     }
@@ -352,17 +352,35 @@ fn time_duplicates_and_consumed_emcys_are_events() {
     assert!(matches!(events[1], NodeEvent::EmcyReceived { node_id: 5, emcy: Emcy { code: 0x8130, .. } }));
     assert_eq!(events[2], NodeEvent::DuplicateNodeId { node_id: 4 });
     bench.set(0x1012, 0, 0x4000_0100);
-    assert!(bench.node.send_time(Default::default(), &mut bench.out));
+    assert!(bench.node.send_time(crate::protocol::time_stamp::TimeOfDay::default(), &mut bench.out));
     assert_eq!(bench.sent().last().unwrap().0, 0x100);
 }
 
 fn any_frame() -> impl Strategy<Value = CanFrame> {
     let ids = prop_oneof![
-        Just(0u32), Just(0x80), Just(0x100), Just(0x204), Just(0x304), Just(0x184), Just(0x604), Just(0x701),
-        Just(0x704), Just(0x7E5), 0u32..0x800, any::<u32>()
+        Just(0u32),
+        Just(0x80),
+        Just(0x100),
+        Just(0x204),
+        Just(0x304),
+        Just(0x184),
+        Just(0x604),
+        Just(0x701),
+        Just(0x704),
+        Just(0x7E5),
+        0u32..0x800,
+        any::<u32>()
     ];
-    let first = prop_oneof![Just(0x23u8), Just(0x2F), Just(0x2B), Just(0x40), Just(0x21), Just(0xC6), any::<u8>()];
-    let index = prop_oneof![0x1000u16..0x102A, 0x1400u16..0x1404, 0x1600u16..0x1604, 0x1800u16..0x1804, 0x1A00u16..0x1A04, any::<u16>()];
+    let first =
+        prop_oneof![Just(0x23u8), Just(0x2F), Just(0x2B), Just(0x40), Just(0x21), Just(0xC6), any::<u8>()];
+    let index = prop_oneof![
+        0x1000u16..0x102A,
+        0x1400u16..0x1404,
+        0x1600u16..0x1604,
+        0x1800u16..0x1804,
+        0x1A00u16..0x1A04,
+        any::<u16>()
+    ];
     (ids, first, index, 0u8..9, any::<[u8; 4]>(), 0u8..10, any::<bool>(), any::<bool>()).prop_map(
         |(id, first, index, sub, data, len, raw, remote)| {
             let [low, high] = index.to_le_bytes();

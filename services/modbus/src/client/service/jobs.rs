@@ -1,9 +1,9 @@
 //! Jobs of programs and tools: JSON in, requests of the line, JSON out.
 
-use super::Service;
 use super::super::ask::{Ask, AskError};
 use super::super::line::Failure;
 use super::super::plan::{LinePlan, find_unit};
+use super::Service;
 use ipc_types::clock;
 use ipc_types::payload::{JobResult, Stamp};
 use serde_json::{Value, json};
