@@ -84,7 +84,7 @@ impl Pattern {
             let dice = self.random();
             extended = dice & 1 == 1;
             fd = self.fd.filter(|_| dice & 2 == 2).map(|_| ((dice >> 2) % 4) as u8);
-            remote = fd.is_none() && (dice >> 4) % 8 == 0;
+            remote = fd.is_none() && (dice >> 4).is_multiple_of(8);
         }
         let mask = if extended { EFF_MASK } else { SFF_MASK };
         let id = match self.id {

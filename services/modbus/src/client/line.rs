@@ -609,7 +609,8 @@ impl Line {
     /// The request whose turn it is, or when there may be one.
     fn choose(&self, now_ns: u64) -> Result<Origin, Option<u64>> {
         let mut next_ns: Option<u64> = None;
-        let (mut write, mut read): (Option<(u64, usize)>, Option<(u64, usize)>) = (None, None);
+        let mut write: Option<(u64, usize)> = None;
+        let mut read: Option<(u64, usize)> = None;
         for (i, slot) in self.slots.iter().enumerate() {
             let Some(due_ns) = slot.due_ns.filter(|_| slot.enabled) else { continue };
             let Some(free_ns) = self.free_ns(Origin::Slot(i), slot.unit, &slot.pdu, true, now_ns) else {

@@ -57,7 +57,7 @@ fn system(what: &'static str) -> impl Fn(io::Error) -> RunError {
 }
 
 enum Transport {
-    Serial(SerialPort),
+    Serial(Box<SerialPort>),
     Tcp(Link),
 }
 
@@ -165,7 +165,7 @@ async fn serve(mut ctx: Context) -> Result<(), RunError> {
     let shutdown = ctx.shutdown_fd().try_clone_to_owned().map_err(system("duplicating a descriptor"))?;
     let shutdown = readable::watch(shutdown).map_err(system("watching the shutdown descriptor"))?;
     let mut alarm = Alarm::new().map_err(system("making a clock"))?;
-    let mut service = Service::new(&mut ctx, &reports_in)?.with(ctx);
+    let mut service = Service::prepare(&mut ctx, &reports_in)?.with(ctx);
     // Tells the plc that its inputs have no data yet, so that its first scan need not wait.
     service.publish(true);
     service.status();
@@ -204,7 +204,7 @@ impl Half {
 }
 
 impl Service {
-    fn new(ctx: &mut Context, reports: &Reports) -> Result<Half, RunError> {
+    fn prepare(ctx: &mut Context, reports: &Reports) -> Result<Half, RunError> {
         let config: Config = ctx.config()?;
         let name = ctx.service.clone();
         let wiring = ctx.entry().map(|entry| entry.wiring.clone()).unwrap_or_default();
@@ -599,7 +599,7 @@ fn runner(
             let port = SerialPort::new(tx, rx, *ascii, ctx.writer, ctx.generation);
             let settings =
                 Settings { serial: true, turnaround_ns: Some(turnaround_ns), send_limit_ns: SEND_LIMIT_NS };
-            (settings, Transport::Serial(port))
+            (settings, Transport::Serial(Box::new(port)))
         }
         target => {
             let broadcasts = matches!(target, Target::RtuOverTcp(_));

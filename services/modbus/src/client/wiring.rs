@@ -71,14 +71,14 @@ fn type_name(
         return Some(iec.name().to_owned());
     }
     let bits = parse_address(address, addressing).ok().filter(|_| symbol)?.size.bits();
-    Some(match bits {
+    let name = match bits {
         1 => "BOOL",
         8 => "BYTE",
         16 => "WORD",
         32 => "DWORD",
         _ => "LWORD",
-    })
-    .map(str::to_owned)
+    };
+    Some(name.to_owned())
 }
 
 fn input_range(config: &Config, range: &ReadRange) -> ImageRange {

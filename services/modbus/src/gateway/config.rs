@@ -311,7 +311,11 @@ fn cached(i: usize, entry: &CacheEntry, plan: &mut Plan) {
             max_age_ns: entry.max_age.map_or(entry.period.ns().saturating_mul(3), |age| age.ns()),
         }),
         _ => {
-            plan.wrong(format!("{key}.unit"), format!("unit {} is on no line", entry.unit), "map it in units")
+            plan.wrong(
+                format!("{key}.unit"),
+                format!("unit {} is on no line", entry.unit),
+                "map it in units",
+            );
         }
     }
 }
