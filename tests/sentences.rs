@@ -127,12 +127,12 @@ fn a_stack_that_does_not_run_says_so() {
 fn a_new_stack_has_its_folders_name_and_is_accepted() {
     let scratch = Scratch::new("new");
     let dir = scratch.0.join("my-gateway");
-    let made = dinrail().args(["new", "--from", "demo"]).arg(&dir).output().unwrap();
+    let made = dinrail().args(["new", "--from", "conveyor"]).arg(&dir).output().unwrap();
     assert!(made.status.success(), "{}", both(&made));
     says(&std::fs::read_to_string(dir.join("stack.toml")).unwrap(), &["name = \"my-gateway\""]);
     let checked = dinrail().arg("check").arg(&dir).output().unwrap();
     assert!(checked.status.success(), "{}", both(&checked));
-    let again = dinrail().args(["new", "--from", "demo"]).arg(&dir).output().unwrap();
+    let again = dinrail().args(["new", "--from", "conveyor"]).arg(&dir).output().unwrap();
     assert_eq!(again.status.code(), Some(1));
     says(&both(&again), &["exists", "nothing was written"]);
 }

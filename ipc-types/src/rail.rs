@@ -167,5 +167,10 @@ pub fn port_limits(kind: TopicKind, writers: usize, readers: usize) -> (u32, u32
             _ => readers as u32 + SPARE_PORTS,
         },
     };
-    (writers as u32 + SPARE_PORTS, subscribers)
+    let publishers = match kind {
+        // The launcher writes events too, and so does every tool that looks on.
+        TopicKind::Events => writers as u32 + 2 * SPARE_PORTS,
+        _ => writers as u32 + SPARE_PORTS,
+    };
+    (publishers, subscribers)
 }

@@ -32,9 +32,9 @@ pub static STACKS: &[ReadyStack] = &[
         files: files!("canopen-io": "README.md", "io401.eds", "main.st", "stack.toml"),
     },
     ReadyStack {
-        name: "demo",
+        name: "conveyor",
         about: "a conveyor's CAN bus, a program, Modbus TCP and a recorder",
-        files: files!("demo": "README.md", "conveyor.log", "main.st", "stack.toml"),
+        files: files!("conveyor": "README.md", "conveyor.log", "main.st", "stack.toml"),
     },
     ReadyStack {
         name: "meter-logger",

@@ -1,6 +1,7 @@
 //! What the cross-process tests share: a stack of one's own, foreign programs, waiting for conditions.
 #![allow(dead_code, clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+pub mod canopen;
 pub mod car;
 pub mod modbus;
 pub mod pcap;

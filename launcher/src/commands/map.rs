@@ -55,6 +55,9 @@ enum Role {
 struct Register {
     /// The modbus-server; absent = the stack has none and this is where the default map would show it.
     server: Option<String>,
+    /// Absent = the map of all units without one of their own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    unit: Option<u8>,
     table: &'static str,
     /// From 0, as on the wire.
     address: u16,
@@ -65,10 +68,13 @@ struct Register {
     bit: Option<u8>,
 }
 
-/// Registers of one server, for what no field service exchanges.
+/// Registers of one server, or of one of its units, for what no field service exchanges.
 #[derive(Debug, Serialize)]
 struct ServerMap {
     server: String,
+    /// Absent = all units without a map of their own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    unit: Option<u8>,
     plc: String,
     ranges: Vec<MapRow>,
 }
@@ -101,10 +107,10 @@ fn collect(stack: &Stack) -> anyhow::Result<(Vec<Point>, Vec<ServerMap>)> {
     let mut servers = Vec::new();
     for plc in stack.services.iter().filter(|s| s.kind == "plc") {
         let maps = maps_of(stack, plc, plc_table::areas(&plc.config))?;
-        for (server, map) in &maps {
+        for Shown { server, unit, map } in &maps {
             if let Some(server) = server {
-                let ranges = map.rows(Addressing::Element);
-                servers.push(ServerMap { server: server.clone(), plc: plc.name.clone(), ranges });
+                let (server, plc) = (server.clone(), plc.name.clone());
+                servers.push(ServerMap { server, unit: *unit, plc, ranges: map.rows(Addressing::Element) });
             }
         }
         let mut ranges: Vec<(&ServiceEntry, ImageRange, Role)> = Vec::new();
@@ -164,40 +170,45 @@ fn variables(stack: &Stack, plc: &ServiceEntry) -> anyhow::Result<Vec<ImageRange
     Ok(found)
 }
 
+/// A register map over the image of a plc.
+struct Shown {
+    /// `None`: the default map of a stack without a server.
+    server: Option<String>,
+    /// `None`: of all units without a map of their own.
+    unit: Option<u8>,
+    map: RegisterMap,
+}
+
 /// The register maps over the image of a plc; the default map when there is no server.
-fn maps_of(
-    stack: &Stack,
-    plc: &ServiceEntry,
-    sizes: AreaSizes,
-) -> anyhow::Result<Vec<(Option<String>, RegisterMap)>> {
+fn maps_of(stack: &Stack, plc: &ServiceEntry, sizes: AreaSizes) -> anyhow::Result<Vec<Shown>> {
     let mut maps = Vec::new();
     let addressing = addressing_of(Some(plc));
     let servers = stack.services.iter().filter(|s| s.kind == "modbus-server");
     for server in servers.filter(|s| s.wiring.plc.as_deref() == Some(&plc.name)) {
         let config: dinrail_modbus::Config = serde_json::from_value(server.config.clone())
             .with_context(|| format!("configuration of service '{}'", server.name))?;
-        let mut map = config
-            .map
-            .build(AreaSizes::MAX, addressing)
-            .with_context(|| format!("map of service '{}'", server.name))?;
-        map.set_sizes(sizes);
-        maps.push((Some(server.name.clone()), map));
+        let units = std::iter::once(None).chain(config.unit.iter().map(|unit| Some(unit.id)));
+        for (unit, map) in units.zip(config.maps()) {
+            let mut map = map
+                .build(AreaSizes::MAX, addressing)
+                .with_context(|| format!("map of service '{}'", server.name))?;
+            map.set_sizes(sizes);
+            maps.push(Shown { server: Some(server.name.clone()), unit, map });
+        }
     }
     if maps.is_empty() {
         let map = MapConfig::default().build(sizes, addressing).context("default map")?;
-        maps.push((None, map));
+        maps.push(Shown { server: None, unit: None, map });
     }
     Ok(maps)
 }
 
 /// Where a map shows a place: as a bit or a register, else as a bit of a register.
-fn registers(
-    server: Option<&String>,
-    map: &RegisterMap,
-    (area, byte, bit): (Area, u32, Option<u8>),
-) -> Vec<Register> {
+fn registers(shown: &Shown, (area, byte, bit): (Area, u32, Option<u8>)) -> Vec<Register> {
+    let map = &shown.map;
     let register = |(table, at): (Table, u16), bit| Register {
-        server: server.cloned(),
+        server: shown.server.clone(),
+        unit: shown.unit,
         table: table.name(),
         address: at,
         number: traditional_number(table, at),
@@ -220,13 +231,10 @@ fn point(
     entry: &ServiceEntry,
     range: &ImageRange,
     role: Role,
-    maps: &[(Option<String>, RegisterMap)],
+    maps: &[Shown],
 ) -> Point {
     let at = LocatedAddress::new(range.area.letter(), range.byte, range.bit, range.bytes);
-    let modbus = maps
-        .iter()
-        .flat_map(|(server, map)| registers(server.as_ref(), map, (range.area, range.byte, range.bit)))
-        .collect();
+    let modbus = maps.iter().flat_map(|map| registers(map, (range.area, range.byte, range.bit))).collect();
     Point {
         plc: plc.name.clone(),
         element: at.and_then(|at| at.text(Addressing::Element)),
@@ -251,8 +259,9 @@ fn row(point: &Point) -> Vec<String> {
         .iter()
         .map(|r| {
             let server = r.server.as_ref().filter(|_| several).map(|s| format!("{s}: ")).unwrap_or_default();
+            let unit = r.unit.map(|unit| format!("unit {unit} ")).unwrap_or_default();
             let bit = r.bit.map(|b| format!("bit {b} of ")).unwrap_or_default();
-            format!("{server}{bit}{} {} ({})", r.table, r.address, r.number)
+            format!("{server}{unit}{bit}{} {} ({})", r.table, r.address, r.number)
         })
         .collect();
     let or_dash = |text: &Option<String>| text.clone().unwrap_or_else(|| "-".to_owned());
@@ -289,7 +298,8 @@ fn text(points: &[Point], servers: &[ServerMap]) -> String {
         out += "no point matches\n";
     }
     for server in servers {
-        out += &format!("\nregisters of '{}' over the image of '{}'\n", server.server, server.plc);
+        let unit = server.unit.map(|unit| format!("unit {unit} of ")).unwrap_or_default();
+        out += &format!("\nregisters of {unit}'{}' over the image of '{}'\n", server.server, server.plc);
         let rows: Vec<Vec<String>> = server
             .ranges
             .iter()
@@ -340,9 +350,8 @@ mod tests {
             ]
         );
         assert_eq!(servers.len(), 1);
-        let (_, map) =
-            &maps_of(&loaded.stack, loaded.stack.service("plc").unwrap(), AreaSizes::MAX).unwrap()[0];
-        let found = registers(None, map, (Area::Marker, 7, Some(2)));
+        let maps = maps_of(&loaded.stack, loaded.stack.service("plc").unwrap(), AreaSizes::MAX).unwrap();
+        let found = registers(&maps[0], (Area::Marker, 7, Some(2)));
         assert_eq!((found[0].number.as_str(), found[0].bit), ("40004", Some(10)));
         assert!(text(&points, &servers).contains("registers of 'modbus' over the image of 'plc'"));
         assert_eq!(text(&[], &[]), "no point matches\n");
@@ -372,6 +381,27 @@ mod tests {
         }
         let range = &servers[0].ranges[0];
         assert_eq!((range.first, range.first_address.as_str()), (7, "%QW1"));
+    }
+
+    #[test]
+    fn units_with_maps_of_their_own_are_shown_too() {
+        let folder = Folder::new("map-units");
+        let unit = "\n[[service.unit]]\nid = 5\n\n[[service.unit.map]]\ntable = \"holding\"\nat = 7\ncount = 2\narea = \"%MD10\"\norder = \"ABCD\"\n";
+        let at = STACK.find("\n[[service]]\nname = \"rec\"").unwrap();
+        let loaded = folder.load(&format!("{}{unit}{}", &STACK[..at], &STACK[at..])).unwrap();
+        let (points, servers) = collect(&loaded.stack).unwrap();
+        let units: Vec<_> = servers.iter().map(|s| (s.unit, s.ranges.len())).collect();
+        assert_eq!(units, [(None, 5), (Some(5), 1)]);
+        let shown = points.iter().map(|p| row(p).join(" | ")).find(|row| row.contains("%MD10")).unwrap();
+        assert_eq!(
+            shown,
+            "%MD10 | %MD40 | %MB40 to %MB43 | - | - | holding_registers 20 (40021), unit 5 holding_registers 8 (40009) | unit 5 holding_registers 7-8 | to modbus"
+        );
+        let shown = text(&points, &servers);
+        assert!(shown.contains("\nregisters of unit 5 of 'modbus' over the image of 'plc'\n"), "{shown}");
+        assert!(shown.contains("7 to 8") && shown.contains("high word first"), "{shown}");
+        let json = serde_json::to_value(&points).unwrap().to_string();
+        assert!(json.contains(r#""unit":5"#), "{json}");
     }
 
     #[test]

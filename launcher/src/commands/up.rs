@@ -10,7 +10,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 /// Name of the ready stack that `demo` runs.
-const DEMO: &str = "demo";
+const DEMO: &str = "canopen-io";
 /// Text of its tour, with places for the executable and the folder.
 const TOUR: &str = include_str!("demo_tour.txt");
 

@@ -114,7 +114,7 @@ fn read_file(path: &Path) -> Result<String, (String, &'static str)> {
     let metadata = std::fs::metadata(path).map_err(|e| {
         (
             format!("cannot read the stack file: {e}"),
-            "name a stack file or its folder; `dinrail new --from demo DIR` makes one",
+            "name a stack file or its folder; `dinrail new --from conveyor DIR` makes one",
         )
     })?;
     if !metadata.is_file() {

@@ -150,6 +150,14 @@ fn a_register_that_the_program_assigns_too_is_a_warning() {
     assert_eq!(loaded.findings[0].excerpt, "[[service.map]]");
     // The setpoint alone is the client's.
     assert!(folder.load(&text.replace("count = 2", "count = 1")).unwrap().findings.is_empty());
+    // The map of a unit is no different.
+    let unit = format!("\n[[service.unit]]\nid = 5\n{}", map.replace("service.map", "service.unit.map"));
+    let text = STACK.replacen("port = 1502 }\n", &format!("port = 1502 }}\n{unit}"), 1);
+    let loaded = folder.load(&text).unwrap();
+    let shown: Vec<&str> = loaded.findings.iter().map(|f| f.message.as_str()).collect();
+    assert_eq!(shown.len(), 1, "{shown:?}");
+    assert!(shown[0].contains("holding_registers 1 (40002) of unit 5, but"), "{shown:?}");
+    assert_eq!(loaded.findings[0].excerpt, "[[service.unit.map]]");
 }
 
 #[test]

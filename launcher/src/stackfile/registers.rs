@@ -11,44 +11,77 @@ use dinrail_plc::program;
 use ipc_types::stack::{ServiceEntry, Stack};
 use ipc_types::wiring::{Area, AreaSizes};
 
-/// Warns once for each `[[service.map]]` table with such a register.
+/// Warns once for each `[[service.map]]` or `[[service.unit.map]]` table with such a register.
 pub fn check(document: &Document, stack: &Stack, sink: &mut Sink<'_>) {
     for server in stack.services.iter().filter(|s| s.kind == "modbus-server") {
         let Ok(config) = serde_json::from_value::<dinrail_modbus::Config>(server.config.clone()) else {
             continue;
         };
-        let MapConfig::Tables(tables) = &config.map else { continue };
-        let plc = server.wiring.plc.as_deref().and_then(|p| stack.service(p));
-        let addressing = dinrail_modbus::service::addressing_of(plc);
-        let Ok(map) = config.map.build(AreaSizes::MAX, addressing) else { continue };
-        let mut warned: Vec<usize> = Vec::new();
-        for (access, place) in plc.map(|plc| assignments(stack, plc)).unwrap_or_default() {
-            for (area, byte, bit) in places(&access) {
-                for (table, at) in map.entries_at(area, byte, bit) {
-                    let index = tables.iter().position(|t| shows(t, table, at));
-                    let Some(index) = index.filter(|i| !warned.contains(i)) else { continue };
-                    let read_only = matches!(table, Table::DiscreteInputs | Table::InputRegisters);
-                    if read_only || map.check(Access::Write, table, at, 1).is_err() {
-                        continue;
-                    }
-                    warned.push(index);
-                    let bytes = if bit.is_some() { 1 } else { 2 };
-                    let address = LocatedAddress::new(area.letter(), byte, bit, bytes);
-                    let address = address.map(|a| a.text(addressing).unwrap_or_else(|| a.to_string()));
-                    let address = address.unwrap_or_default();
-                    sink.warning(
-                        &document.place(&server.name, &format!("map[{index}]")),
-                        format!(
-                            "Modbus clients may write {} {at} ({}), but the program assigns {address} too ({place}), and wins",
-                            table.name(),
-                            traditional_number(table, at)
-                        ),
-                        "show it as input_registers or discrete_inputs, or let the program leave it alone",
-                    );
-                }
+        if !config.maps().any(|map| matches!(map, MapConfig::Tables(_))) {
+            continue;
+        }
+        let Some(plc) = server.wiring.plc.as_deref().and_then(|p| stack.service(p)) else { continue };
+        let assigned = assignments(stack, plc);
+        let own = config.unit.iter().enumerate();
+        let own = own.map(|(i, unit)| (format!("unit[{i}].map"), format!(" of unit {}", unit.id)));
+        let keys = std::iter::once(("map".to_owned(), String::new())).chain(own);
+        for ((key, unit), map) in keys.zip(config.maps()) {
+            let Some(found) = contested(map, plc, &assigned) else { continue };
+            for Contested { index, register, address, place } in found {
+                sink.warning(
+                    &document.place(&server.name, &format!("{key}[{index}]")),
+                    format!(
+                        "Modbus clients may write {register}{unit}, but the program assigns {address} too ({place}), and wins"
+                    ),
+                    "show it as input_registers or discrete_inputs, or let the program leave it alone",
+                );
             }
         }
     }
+}
+
+/// A register or coil that clients may write and the program assigns.
+struct Contested {
+    /// Of the table, from 0.
+    index: usize,
+    register: String,
+    address: String,
+    /// In the program.
+    place: String,
+}
+
+/// The first such one of each table; `None` for a ready map and one that cannot be built.
+fn contested(
+    map: &MapConfig,
+    plc: &ServiceEntry,
+    assigned: &[(artifact::Access, String)],
+) -> Option<Vec<Contested>> {
+    let MapConfig::Tables(tables) = map else { return None };
+    let addressing = dinrail_modbus::service::addressing_of(Some(plc));
+    let built = map.build(AreaSizes::MAX, addressing).ok()?;
+    let mut found: Vec<Contested> = Vec::new();
+    for (access, place) in assigned {
+        for (area, byte, bit) in places(access) {
+            for (table, at) in built.entries_at(area, byte, bit) {
+                let Some(index) = tables.iter().position(|t| shows(t, table, at)) else { continue };
+                let read_only = matches!(table, Table::DiscreteInputs | Table::InputRegisters);
+                let warned = found.iter().any(|f| f.index == index);
+                if warned || read_only || built.check(Access::Write, table, at, 1).is_err() {
+                    continue;
+                }
+                let bytes = if bit.is_some() { 1 } else { 2 };
+                let address = LocatedAddress::new(area.letter(), byte, bit, bytes);
+                let address = address.map(|a| a.text(addressing).unwrap_or_else(|| a.to_string()));
+                found.push(Contested {
+                    index,
+                    register: format!("{} {at} ({})", table.name(), traditional_number(table, at)),
+                    address: address.unwrap_or_default(),
+                    place: place.clone(),
+                });
+            }
+        }
+    }
+    Some(found)
 }
 
 fn shows(entry: &MapEntry, table: Table, at: u16) -> bool {

@@ -6,7 +6,9 @@ use ipc_types::Context;
 use ipc_types::rail::RailError;
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
-use std::time::Duration;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
 
 /// Longest line of an answer.
 const REPLY_BYTES_MAX: u64 = 16 * 1024 * 1024;
@@ -46,9 +48,40 @@ fn choose(mut running: Vec<RunningStack>, name: Option<&str>) -> Result<RunningS
     }
 }
 
-/// Joins the rail of a running stack as a tool. Once a process.
+/// How long a clean-up of what dead tools left may take.
+const CLEAN_LIMIT: Duration = Duration::from_secs(2);
+
+/// Joins the rail of a running stack as a tool. Once a process. Tools that were killed keep their place until somebody
+/// cleans up after them: when there is none left, that is done first.
 pub fn observe(stack: &RunningStack) -> Result<Context, RailError> {
+    match Context::observer(&stack.root) {
+        Err(e) if is_full(&e) => clean_up(&stack.root),
+        result => return result,
+    }
     Context::observer(&stack.root)
+}
+
+/// Whether a topic has no place left for one more tool.
+pub fn is_full(error: &RailError) -> bool {
+    error.to_string().contains("ExceedsMaxSupported")
+}
+
+/// In a process of its own, because it can hang.
+fn clean_up(root: &Path) {
+    let Ok(own) = std::env::current_exe() else { return };
+    let mut command = Command::new(own);
+    command.arg("__clean").arg("--root").arg(root).arg("--parent").arg(std::process::id().to_string());
+    let spawned = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
+    let Ok(mut child) = spawned else { return };
+    let begin = Instant::now();
+    while begin.elapsed() < CLEAN_LIMIT {
+        if !matches!(child.try_wait(), Ok(None)) {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let _ = child.kill();
+    let _ = child.wait();
 }
 
 /// A connection to a launcher.

@@ -7,13 +7,14 @@ use ipc_types::stack::{ServiceEntry, Stack};
 use ipc_types::units::Span;
 use serde::{Deserialize, Serialize};
 
+use crate::character::{Character, Flow, Parity};
 use crate::driver::Settings;
 use crate::port::{Kind, Options, Target};
 use crate::protocol::framer::{self, MAX_ASCII, MAX_DELIMITER, Mode};
 use crate::protocol::length::MAX_RTU;
 use crate::protocol::sender;
 use crate::protocol::timing::Timing;
-use crate::sys::{Character, Flow, Parity, Rs485};
+use crate::sys::Rs485;
 
 /// How frames are told apart.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]

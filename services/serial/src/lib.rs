@@ -5,10 +5,12 @@
 //! must never interpret a frame beyond its end and its CRC, never wait for a reader, and never die of a port that is
 //! unplugged.
 //!
-//! Storeys: [`protocol`] bytes and time, sans-I/O; [`dialog`] recorded dialogs, sans-I/O; [`sys`], [`port`] and
-//! [`list`] the system; [`driver`] a port with all of it; [`config`] and the functions below the service on the rail.
+//! Storeys: [`protocol`] bytes and time, sans-I/O; [`dialog`] recorded dialogs, sans-I/O; [`sys`], [`character`],
+//! [`device`], [`port`] and [`list`] the system; [`driver`] a port with all of it; [`config`] and the functions below the service on the rail.
 
+pub mod character;
 pub mod config;
+pub mod device;
 pub mod dialog;
 pub mod driver;
 pub mod list;

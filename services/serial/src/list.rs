@@ -6,6 +6,9 @@ use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
+use serialport::SerialPortType;
+
+const CLASS: &str = "/sys/class/tty";
 
 /// A process that has a port open.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -62,30 +65,34 @@ fn text(path: &Path) -> Option<String> {
 }
 
 fn sysfs(device: &Path) -> Option<PathBuf> {
-    Some(Path::new("/sys/class/tty").join(device.file_name()?))
+    Some(Path::new(CLASS).join(device.file_name()?))
 }
 
 /// Whether a USB adapter carries this device (`/dev/ttyUSB0`, links followed).
 pub fn is_usb(device: &Path) -> bool {
-    usb_of(device).is_some()
+    usb_ports().iter().any(|(name, _)| Path::new(name) == device)
 }
 
-fn usb_of(device: &Path) -> Option<Usb> {
-    let mut at = sysfs(device)?.join("device").canonicalize().ok()?;
-    // The port, its interface, its adapter: the latter has the ids.
-    for _ in 0..6 {
-        if let (Some(vendor), Some(product)) = (text(&at.join("idVendor")), text(&at.join("idProduct"))) {
-            return Some(Usb {
-                vendor,
-                product,
-                manufacturer: text(&at.join("manufacturer")),
-                name: text(&at.join("product")),
-                serial: text(&at.join("serial")),
-            });
-        }
-        at = at.parent()?.to_owned();
+/// The ports of USB adapters, by device.
+fn usb_ports() -> Vec<(String, Usb)> {
+    // `serialport` panics where there is none.
+    if !Path::new(CLASS).is_dir() {
+        return Vec::new();
     }
-    None
+    let ports = serialport::available_ports().unwrap_or_default();
+    ports.into_iter().filter_map(|port| Some((port.port_name, usb_of(port.port_type)?))).collect()
+}
+
+fn usb_of(port: SerialPortType) -> Option<Usb> {
+    let SerialPortType::UsbPort(usb) = port else { return None };
+    let said = |text: Option<String>| text.filter(|t| !t.is_empty());
+    Some(Usb {
+        vendor: format!("{:04x}", usb.vid),
+        product: format!("{:04x}", usb.pid),
+        manufacturer: said(usb.manufacturer),
+        name: said(usb.product),
+        serial: said(usb.serial_number),
+    })
 }
 
 /// The latency timer of an FTDI adapter in ms, after an attempt to set it to 1 when `asked` did not do it.
@@ -121,6 +128,28 @@ pub fn holders(device: &Path) -> Vec<Holder> {
     found
 }
 
+/// Who has locked the device (`flock`), so that nobody else may lock it `alone` or, if not, with others. Unlike
+/// [`holders`] it sees the processes of all users.
+pub fn lock_holder(device: &fs::Metadata, alone: bool) -> Option<Holder> {
+    let locks = fs::read_to_string("/proc/locks").ok()?;
+    let pid = locker(&locks, device.dev(), device.ino(), alone)?;
+    let program = text(&Path::new("/proc").join(pid.to_string()).join("comm"));
+    Some(Holder { pid, program: program.unwrap_or_else(|| "?".to_owned()) })
+}
+
+/// `1: FLOCK  ADVISORY  WRITE 1234 00:05:67 0 EOF`: kind, mode, process, file system and file.
+fn locker(locks: &str, dev: u64, ino: u64, alone: bool) -> Option<u32> {
+    let file = format!("{:02x}:{:02x}:{ino}", rustix::fs::major(dev), rustix::fs::minor(dev));
+    locks.lines().find_map(|line| {
+        let mut words = line.split_whitespace().skip(1);
+        let kind = words.next()?;
+        let mode = words.nth(1)?;
+        let pid = words.next()?.parse().ok()?;
+        let same = kind == "FLOCK" && words.next()? == file;
+        (same && (alone || mode == "WRITE")).then_some(pid)
+    })
+}
+
 /// What gives this user access to a device.
 pub fn permission_remedy(path: &Path) -> String {
     let group = fs::metadata(path).ok().map(|m| m.gid()).and_then(group_name);
@@ -150,8 +179,7 @@ fn by_id(device: &Path) -> Option<String> {
         .map(|p| p.display().to_string())
 }
 
-/// One port.
-pub fn describe(device: &Path) -> PortInfo {
+fn describe(device: &Path, usb: Option<Usb>) -> PortInfo {
     let driver = sysfs(device)
         .and_then(|s| fs::read_link(s.join("device/driver")).ok())
         .and_then(|d| Some(d.file_name()?.to_string_lossy().into_owned()));
@@ -160,7 +188,7 @@ pub fn describe(device: &Path) -> PortInfo {
         device: device.display().to_string(),
         by_id: by_id(device),
         driver,
-        usb: usb_of(device),
+        usb,
         latency_timer_ms: sysfs(device)
             .and_then(|s| text(&s.join("device/latency_timer")))
             .and_then(|t| t.parse().ok()),
@@ -171,18 +199,25 @@ pub fn describe(device: &Path) -> PortInfo {
 
 /// Every port with hardware behind it, by name.
 pub fn ports() -> Vec<PortInfo> {
-    let Ok(entries) = fs::read_dir("/sys/class/tty") else { return Vec::new() };
+    let Ok(entries) = fs::read_dir(CLASS) else { return Vec::new() };
     let mut names: Vec<String> =
         entries.flatten().map(|e| e.file_name().to_string_lossy().into_owned()).collect();
     names.sort_by_key(|name| {
         (name.trim_end_matches(|c: char| c.is_ascii_digit()).to_owned(), name.len(), name.clone())
     });
-    names.iter().filter(|name| is_port(name)).map(|name| describe(&Path::new("/dev").join(name))).collect()
+    let mut usb = usb_ports();
+    let mut describe = |name: &String| {
+        let device = Path::new("/dev").join(name);
+        let at = usb.iter().position(|(name, _)| Path::new(name) == device);
+        describe(&device, at.map(|at| usb.swap_remove(at).1))
+    };
+    // `serialport` knows ports of some buses only, and none of their drivers.
+    names.iter().filter(|name| is_port(name)).map(&mut describe).collect()
 }
 
 /// Virtual consoles have no device behind them; the kernel lists UARTs of type 0 that are not there.
 fn is_port(name: &str) -> bool {
-    let dir = Path::new("/sys/class/tty").join(name);
+    let dir = Path::new(CLASS).join(name);
     dir.join("device").exists()
         && text(&dir.join("type")).is_none_or(|kind| kind != "0")
         && Path::new("/dev").join(name).exists()
@@ -199,7 +234,37 @@ mod tests {
         }
         assert!(!is_usb(Path::new("/dev/null")) && !is_usb(Path::new("/")));
         assert_eq!(latency_timer(Path::new("/dev/null"), false), None);
-        assert_eq!(describe(Path::new("/dev/null")).by_id, None);
+        assert_eq!(describe(Path::new("/dev/null"), None).by_id, None);
+    }
+
+    #[test]
+    fn what_a_usb_adapter_says() {
+        let said = |text: &str| Some(text.to_owned());
+        let info = serialport::UsbPortInfo {
+            vid: 0x403,
+            pid: 0x6001,
+            serial_number: said("A50285BI"),
+            manufacturer: said(""),
+            product: said("FT232R USB UART"),
+        };
+        let usb = usb_of(SerialPortType::UsbPort(info)).unwrap();
+        assert_eq!((usb.vendor.as_str(), usb.product.as_str()), ("0403", "6001"));
+        assert_eq!(
+            (usb.manufacturer, usb.name, usb.serial),
+            (None, said("FT232R USB UART"), said("A50285BI"))
+        );
+        assert_eq!(usb_of(SerialPortType::PciPort), None);
+    }
+
+    #[test]
+    fn locks_are_read() {
+        let locks = "1: POSIX  ADVISORY  WRITE 7 00:05:67 0 EOF\n1: -> FLOCK ADVISORY WRITE 8 00:05:67 0 EOF\n\
+            2: FLOCK  ADVISORY  READ 9 00:05:67 0 EOF\n3: FLOCK  ADVISORY  WRITE 10 fe:1a:68 0 EOF\nnonsense\n4:\n";
+        let (devices, disk) = (rustix::fs::makedev(0, 5), rustix::fs::makedev(0xfe, 0x1a));
+        assert_eq!(locker(locks, devices, 67, true), Some(9));
+        assert_eq!(locker(locks, devices, 67, false), None);
+        assert_eq!(locker(locks, disk, 68, false), Some(10));
+        assert_eq!(locker(locks, disk, 67, true), None);
     }
 
     #[test]

@@ -5,18 +5,20 @@
 use std::io;
 use std::net::{TcpStream, ToSocketAddrs};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::os::unix::fs::{FileTypeExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use ipc_types::payload::serial_flag;
-use rustix::fs::{FlockOperation, inotify};
+use rustix::fs::inotify;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use rustix::termios::{QueueSelector, tcflush};
 use thiserror::Error;
 
+use crate::character::{self, Character};
+use crate::device::Device;
 use crate::list;
 use crate::protocol::parmrk::Unmark;
-use crate::sys::{self, Character, LineCounters, Rs485};
+use crate::sys::{self, LineCounters, Rs485};
 
 /// How long a TCP connection may take.
 const CONNECT: Duration = Duration::from_secs(5);
@@ -196,10 +198,26 @@ struct Made {
     notify: OwnedFd,
 }
 
+#[derive(Debug)]
+enum Wire {
+    Device(Device),
+    /// A connection, or a pseudo-terminal of our own.
+    Other(OwnedFd),
+}
+
+impl AsFd for Wire {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        match self {
+            Self::Device(device) => device.fd(),
+            Self::Other(fd) => fd.as_fd(),
+        }
+    }
+}
+
 /// See the module.
 #[derive(Debug)]
 pub struct Port {
-    fd: OwnedFd,
+    wire: Wire,
     kind: Kind,
     path: String,
     made: Option<Made>,
@@ -224,9 +242,9 @@ impl Port {
         }
     }
 
-    fn plain(fd: OwnedFd, kind: Kind, path: String) -> Self {
+    fn plain(wire: Wire, kind: Kind, path: String) -> Self {
         Self {
-            fd,
+            wire,
             kind,
             path,
             made: None,
@@ -261,7 +279,7 @@ impl Port {
 
     /// Readable when there are bytes.
     pub fn fd(&self) -> BorrowedFd<'_> {
-        self.fd.as_fd()
+        self.wire.as_fd()
     }
 
     /// Readable when somebody opens the pseudo-terminal that we made.
@@ -274,14 +292,14 @@ impl Port {
         if let Some(made) = &self.made {
             let mut buffer = [0u8; 1024];
             while matches!(rustix::io::read(&made.notify, &mut buffer), Ok(n) if n > 0) {}
-            self.nobody = hung_up(self.fd.as_fd());
+            self.nobody = hung_up(self.wire.as_fd());
         }
         !self.nobody
     }
 
     /// Reads what is there. An error means that the port is gone.
     pub fn read(&mut self, bytes: &mut [u8]) -> io::Result<Read> {
-        let n = match rustix::io::read(&self.fd, &mut *bytes) {
+        let n = match rustix::io::read(&self.wire, &mut *bytes) {
             Ok(0) => return Err(io::ErrorKind::UnexpectedEof.into()),
             Ok(n) => n,
             Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => return Ok(Read::Nothing),
@@ -305,7 +323,7 @@ impl Port {
             self.errors.breaks += u64::from(marked & serial_flag::BREAK != 0);
             return marked;
         };
-        let Ok(now) = sys::line_counters(self.fd.as_fd()) else { return marked };
+        let Ok(now) = sys::line_counters(self.wire.as_fd()) else { return marked };
         self.counters = Some(now);
         let mut flags = 0;
         let mut grown = |now: i32, before: i32, flag: u32, count: &mut u64| {
@@ -328,7 +346,7 @@ impl Port {
         if self.nobody {
             return Ok(bytes.len());
         }
-        match rustix::io::write(&self.fd, bytes) {
+        match rustix::io::write(&self.wire, bytes) {
             Ok(n) => Ok(n),
             Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => Ok(0),
             Err(e) => Err(e.into()),
@@ -337,16 +355,16 @@ impl Port {
 
     /// Whether all bytes have left, as far as it can be known.
     pub fn is_drained(&self) -> io::Result<bool> {
-        match self.kind {
-            Kind::Uart | Kind::Usb => sys::is_drained(self.fd.as_fd()),
-            Kind::Pty | Kind::Tcp => Ok(true),
+        match &self.wire {
+            Wire::Device(device) if self.kind != Kind::Pty => device.is_drained(),
+            _ => Ok(true),
         }
     }
 
     /// Switches the transmitter on or off by RTS, where this process does that.
-    pub fn transmitter(&self, on: bool) -> io::Result<()> {
-        match self.rts_on_send {
-            Some(level) if self.kind != Kind::Pty => sys::set_rts(self.fd.as_fd(), on == level),
+    pub fn transmitter(&mut self, on: bool) -> io::Result<()> {
+        match (&mut self.wire, self.rts_on_send) {
+            (Wire::Device(device), Some(level)) if self.kind != Kind::Pty => device.set_rts(on == level),
             _ => Ok(()),
         }
     }
@@ -354,7 +372,7 @@ impl Port {
     /// Throws away what could not be sent.
     pub fn discard_output(&self) {
         if self.kind != Kind::Tcp {
-            sys::flush(self.fd.as_fd(), false, true);
+            let _ = tcflush(&self.wire, QueueSelector::OFlush);
         }
     }
 }
@@ -378,67 +396,31 @@ fn hung_up(fd: BorrowedFd<'_>) -> bool {
     fds[0].revents().contains(PollFlags::HUP)
 }
 
-/// Majors 136 to 143 are the ends of pseudo-terminals (Unix 98).
-fn is_pty(rdev: u64) -> bool {
-    (136..=143).contains(&rustix::fs::major(rdev))
-}
-
 fn device(path: &Path, options: &Options) -> Result<Port, PortError> {
     let shown = path.display().to_string();
     let system = |what| {
         let path = shown.clone();
         move |source| PortError::System { path, what, source }
     };
-    let file = std::fs::OpenOptions::new()
-        .read(true)
-        .write(true)
-        .custom_flags(libc::O_NOCTTY | libc::O_NONBLOCK | libc::O_CLOEXEC)
-        .open(path)
-        .map_err(|source| match (source.kind(), source.raw_os_error()) {
-            (io::ErrorKind::NotFound, _) | (_, Some(libc::ENXIO | libc::ENODEV)) => {
-                PortError::Absent(shown.clone())
-            }
-            (io::ErrorKind::PermissionDenied, _) => permission(path),
-            (_, Some(libc::EBUSY)) => busy(path),
-            (io::ErrorKind::IsADirectory, _) => PortError::NotSerial(shown.clone()),
-            // A link to a pseudo-terminal that is gone, or a port without hardware.
-            (_, Some(libc::EIO)) => PortError::Absent(shown.clone()),
-            _ => system("opening it")(source),
-        })?;
-    let meta = file.metadata().map_err(system("looking at it"))?;
-    if !meta.file_type().is_char_device() {
-        return Err(PortError::NotSerial(shown));
-    }
-    let whole = path.canonicalize().unwrap_or_else(|_| path.to_owned());
-    let kind = if is_pty(meta.rdev()) {
+    let device = Device::open(path, &options.character, options.exclusive)?;
+    let kind = if device.is_pty() {
         Kind::Pty
-    } else if list::is_usb(&whole) {
+    } else if list::is_usb(device.path()) {
         Kind::Usb
     } else {
         Kind::Uart
     };
     let real = kind != Kind::Pty;
-    let fd = OwnedFd::from(file);
-    if options.exclusive {
-        rustix::fs::flock(&fd, FlockOperation::NonBlockingLockExclusive).map_err(|e| match e {
-            rustix::io::Errno::AGAIN => busy(path),
-            e => system("locking it")(e.into()),
-        })?;
-    }
-    sys::configure(fd.as_fd(), &options.character, real).map_err(|source| match source.raw_os_error() {
-        Some(libc::ENOTTY) => PortError::NotSerial(shown.clone()),
-        Some(libc::EIO) => PortError::Absent(shown.clone()),
-        _ => system("setting rate and character")(source),
-    })?;
-    let mut port = Port::plain(fd, kind, whole.display().to_string());
-    if options.exclusive {
-        sys::exclusive(port.fd()).map_err(system("taking it for this process alone"))?;
-        if let Some(holder) = list::holders(&whole).into_iter().find(|h| h.pid != std::process::id()) {
-            port.notes.push(format!("{shown} is also open in {holder}: it may take bytes away"));
-        }
+    let whole = device.path().to_owned();
+    let mut port = Port::plain(Wire::Device(device), kind, whole.display().to_string());
+    if options.exclusive
+        && let Some(holder) = list::holders(&whole).into_iter().find(|h| h.pid != std::process::id())
+    {
+        port.notes.push(format!("{shown} is also open in {holder}: it may take bytes away"));
     }
     if real && options.verify {
-        let different = sys::differences(port.fd(), &options.character).map_err(system("reading back"))?;
+        let different =
+            character::differences(port.fd(), &options.character).map_err(system("reading back"))?;
         if !different.is_empty() {
             let wanted = options.character.to_string();
             return Err(PortError::Refused { path: shown, wanted, keys: different.join(", ") });
@@ -446,8 +428,9 @@ fn device(path: &Path, options: &Options) -> Result<Port, PortError> {
     }
     if real {
         prepare(&mut port, &shown, options)?;
+        // What came before the port was set is garbage.
+        let _ = tcflush(port.fd(), QueueSelector::IFlush);
     }
-    sys::flush(port.fd(), real, false);
     Ok(port)
 }
 
@@ -485,23 +468,14 @@ fn prepare(port: &mut Port, shown: &str, options: &Options) -> Result<(), PortEr
             ));
         }
     }
+    character::mark_errors(port.fd()).map_err(|source| PortError::System {
+        path: shown.to_owned(),
+        what: "asking for marks of damaged bytes",
+        source,
+    })?;
     port.unmark = Some(Unmark::default());
     port.counters = sys::line_counters(port.fd()).ok();
     Ok(())
-}
-
-fn busy(path: &Path) -> PortError {
-    let holders = list::holders(&path.canonicalize().unwrap_or_else(|_| path.to_owned()));
-    let other = holders.iter().find(|h| h.pid != std::process::id()).or(holders.first());
-    PortError::Busy {
-        path: path.display().to_string(),
-        holder: other.map_or_else(|| "another program".to_owned(), ToString::to_string),
-    }
-}
-
-/// The group that owns the device is the one to join.
-fn permission(path: &Path) -> PortError {
-    PortError::Permission { path: path.display().to_string(), remedy: list::permission_remedy(path) }
 }
 
 fn terminal(link: &Path, character: &Character) -> io::Result<Port> {
@@ -511,7 +485,7 @@ fn terminal(link: &Path, character: &Character) -> io::Result<Port> {
     rustix::fs::fcntl_setfl(&master, rustix::fs::OFlags::NONBLOCK)?;
     let device = PathBuf::from(ptsname(&master, Vec::new())?.to_string_lossy().into_owned());
     // On the master it sets the other end.
-    sys::configure(master.as_fd(), character, false)?;
+    character::make_pipe(master.as_fd(), character)?;
     let notify = inotify::init(inotify::CreateFlags::CLOEXEC | inotify::CreateFlags::NONBLOCK)?;
     inotify::add_watch(&notify, &device, inotify::WatchFlags::OPEN)?;
     match std::fs::symlink_metadata(link) {
@@ -523,7 +497,7 @@ fn terminal(link: &Path, character: &Character) -> io::Result<Port> {
         Err(_) => {}
     }
     std::os::unix::fs::symlink(&device, link)?;
-    let mut port = Port::plain(master, Kind::Pty, device.display().to_string());
+    let mut port = Port::plain(Wire::Other(master), Kind::Pty, device.display().to_string());
     port.made = Some(Made { link: link.to_owned(), device, notify });
     // Until somebody opens it.
     port.nobody = true;
@@ -541,7 +515,7 @@ fn socket(address: &str) -> io::Result<Port> {
                 let _ = rustix::net::sockopt::set_tcp_keepidle(&stream, Duration::from_secs(10));
                 let _ = rustix::net::sockopt::set_tcp_keepintvl(&stream, Duration::from_secs(3));
                 let _ = rustix::net::sockopt::set_tcp_keepcnt(&stream, 3);
-                return Ok(Port::plain(stream.into(), Kind::Tcp, address.to_owned()));
+                return Ok(Port::plain(Wire::Other(stream.into()), Kind::Tcp, address.to_owned()));
             }
             Err(e) => last = e,
         }

@@ -1,5 +1,5 @@
 use super::*;
-use crate::sys::{Flow, Parity};
+use crate::character::{Flow, Parity};
 
 pub(crate) fn options(target: Target) -> Options {
     Options {

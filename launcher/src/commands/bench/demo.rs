@@ -1,4 +1,4 @@
-//! The demo stack under another name, on ports of its own: several benches need a stack of its size.
+//! The conveyor stack under another name, on ports of its own: several benches need a stack of its size.
 
 use super::stack::{BenchStack, Scratch, free_port, unique_name};
 use crate::stacks;
@@ -19,7 +19,7 @@ pub struct Changes {
 pub fn spawn(parent: &Path, what: &str, changes: Changes) -> anyhow::Result<BenchStack> {
     let name = unique_name(what);
     let scratch = Scratch::new(parent, &name)?;
-    stacks::find("demo").context("this build has no demo stack inside")?.write_to(scratch.path())?;
+    stacks::find("conveyor").context("this build has no conveyor stack inside")?.write_to(scratch.path())?;
     let text = std::fs::read_to_string(scratch.path().join("stack.toml"))?;
     scratch.write("stack.toml", &change(&text, &name, changes)?)?;
     BenchStack::spawn(scratch, &name)
@@ -27,7 +27,7 @@ pub fn spawn(parent: &Path, what: &str, changes: Changes) -> anyhow::Result<Benc
 
 fn change(text: &str, name: &str, changes: Changes) -> anyhow::Result<String> {
     let mut doc: Table = toml::from_str(text)?;
-    let shape = "the demo stack has another shape than the benches know";
+    let shape = "the conveyor stack has another shape than the benches know";
     let head = doc.get_mut("stack").and_then(Value::as_table_mut).context(shape)?;
     head.insert("name".into(), name.into());
     let services = doc.get_mut("service").and_then(Value::as_array_mut).context(shape)?;
@@ -58,12 +58,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_demo_stack_can_be_changed() {
-        let demo = stacks::find("demo").unwrap();
+    fn the_conveyor_stack_can_be_changed() {
+        let demo = stacks::find("conveyor").unwrap();
         let (_, text) = demo.files.iter().find(|(name, _)| *name == "stack.toml").unwrap();
         let text = std::str::from_utf8(text).unwrap();
         let changed = change(text, "other", Changes { quiet: true, restarts: true }).unwrap();
-        for gone in ["1502", "29536", "29537", "feed", "\"demo\""] {
+        for gone in ["1502", "29536", "29537", "feed", "\"conveyor\""] {
             assert!(text.contains(gone) && !changed.contains(gone), "{gone}:\n{changed}");
         }
         let services = text.matches("[[service]]").count();

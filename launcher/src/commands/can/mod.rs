@@ -22,7 +22,7 @@ pub mod source;
 mod stats;
 
 use crate::stackfile::nearest;
-use crate::supervise::client::{find, observe};
+use crate::supervise::client::{find, is_full, observe};
 use args::CanCommand;
 use dinrail_can::protocol::frame::Frame;
 use ipc_types::Context;
@@ -30,9 +30,7 @@ use ipc_types::payload::CanFrame;
 use ipc_types::topic::TopicKind;
 use ipc_types::units::Span;
 use std::io::Write;
-use std::path::Path;
-use std::process::{Command, ExitCode, Stdio};
-use std::time::{Duration, Instant};
+use std::process::ExitCode;
 
 pub fn run(command: CanCommand, json: bool) -> anyhow::Result<ExitCode> {
     match command {
@@ -45,19 +43,10 @@ pub fn run(command: CanCommand, json: bool) -> anyhow::Result<ExitCode> {
     }
 }
 
-/// How long a clean-up of what dead tools left may take.
-const CLEAN_LIMIT: Duration = Duration::from_secs(2);
-
-/// Joins the stack meant. Tools that were killed keep their place until somebody cleans up after them: when there is none
-/// left, that is done first.
+/// Joins the stack meant.
 fn join(stack: Option<&str>) -> anyhow::Result<Context> {
     let stack = find(stack)?;
-    let full = |e: &ipc_types::rail::RailError| e.to_string().contains("ExceedsMaxSupported");
-    match observe(&stack) {
-        Err(e) if full(&e) => clean_up(&stack.root),
-        result => return Ok(result?),
-    }
-    observe(&stack).map_err(|e| if full(&e) { crowded(&stack.stack) } else { e.into() })
+    observe(&stack).map_err(|e| if is_full(&e) { crowded(&stack.stack) } else { e.into() })
 }
 
 /// Places for tools are few, because every one costs shared memory on every topic.
@@ -67,29 +56,9 @@ fn crowded(stack: &str) -> anyhow::Error {
     )
 }
 
-/// In a process of its own, because it can hang.
-fn clean_up(root: &Path) {
-    let Ok(own) = std::env::current_exe() else { return };
-    let mut command = Command::new(own);
-    command.arg("__clean").arg("--root").arg(root).arg("--parent").arg(std::process::id().to_string());
-    let spawned = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
-    let Ok(mut child) = spawned else { return };
-    let begin = Instant::now();
-    while begin.elapsed() < CLEAN_LIMIT {
-        if !matches!(child.try_wait(), Ok(None)) {
-            return;
-        }
-        std::thread::sleep(Duration::from_millis(5));
-    }
-    let _ = child.kill();
-    let _ = child.wait();
-}
-
 /// A port on a topic; when it has no place left, in words.
 fn place<T>(ctx: &Context, port: Result<T, ipc_types::rail::RailError>) -> anyhow::Result<T> {
-    port.map_err(|e| {
-        if e.to_string().contains("ExceedsMaxSupported") { crowded(&ctx.stack.name) } else { e.into() }
-    })
+    port.map_err(|e| if is_full(&e) { crowded(&ctx.stack.name) } else { e.into() })
 }
 
 /// Prints; false when nobody reads any more. Not by ending the process: its place on the rail must be given back.

@@ -583,7 +583,9 @@ impl Network {
         self.settle(now_ns, out);
     }
 
-    fn sync(&mut self, now_ns: u64, out: &mut Outbox) {
+    /// The SYNC alone, if it is due: for the beginning of a wake, before frames are taken that waited. A window that
+    /// ends meanwhile ends in [`Self::on_time`], when what came inside of it has been taken.
+    pub fn sync(&mut self, now_ns: u64, out: &mut Outbox) {
         let (Some(at_ns), Some(period_ns)) = (self.next_sync_ns, self.settings.sync_period_ns) else {
             return;
         };

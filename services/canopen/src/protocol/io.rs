@@ -36,6 +36,10 @@ impl Outbox {
     pub fn drain(&mut self) -> impl Iterator<Item = CanFrame> + '_ {
         self.frames.drain(..)
     }
+    /// Takes frames out again that shall not be sent after all.
+    pub fn retain(&mut self, keep: impl FnMut(&CanFrame) -> bool) {
+        self.frames.retain(keep);
+    }
     pub fn is_empty(&self) -> bool {
         self.frames.is_empty()
     }

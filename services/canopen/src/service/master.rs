@@ -283,7 +283,8 @@ impl Service {
                 }
             }
             // The SYNC goes before everything else.
-            self.on_time();
+            self.network.sync(clock::mono_ns(), &mut self.out);
+            self.send();
             if rang {
                 inbox.drain();
             }

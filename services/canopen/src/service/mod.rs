@@ -1,5 +1,6 @@
 //! The services on the rail: what is the same for master and slave.
 
+pub mod fleet;
 mod jobs;
 pub mod load;
 pub mod master;

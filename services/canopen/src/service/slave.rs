@@ -15,7 +15,7 @@ use crate::protocol::lss::slave::LssSlaveEvent;
 use crate::protocol::nmt::NmtState;
 use crate::protocol::node::{Node, NodeEvent, NodeParams};
 use crate::slave::image_map::{self, ImageMap};
-use crate::slave::simulation;
+use crate::slave::{drop_synchronous, is_late_sync, simulation};
 use dinrail_iec::Addressing;
 use ipc_types::event::{EventKind, Level};
 use ipc_types::inbox::Inbox;
@@ -312,6 +312,9 @@ impl Service {
                 last_ns = frame.stamp.t_ns;
                 self.node.on_frame(frame.stamp.t_ns, frame, &mut self.out);
                 self.react(frame.stamp.t_ns);
+                if is_late_sync(&self.node, frame, clock::mono_ns()) {
+                    drop_synchronous(&mut self.out);
+                }
             }
         });
         self.rx = Some(rx);

@@ -46,18 +46,62 @@ struct Unit {
     level: u32,
     /// Line time of the tries since the unit was last well, of the last failure when dead.
     cost_ns: u64,
-    /// A late answer of this shape may still come.
-    suspect: Option<Suspect>,
+    /// Requests whose late answers may still come.
+    suspects: [Suspect; SUSPECTS],
     counters: UnitCounters,
     last_exception: Option<u8>,
     last_rtt_ns: Option<u64>,
     max_rtt_ns: u64,
 }
 
+/// Requests of a unit that are remembered because of their late answers.
+const SUSPECTS: usize = 4;
+
 #[derive(Clone, Copy)]
 struct Suspect {
     pdu: Pdu,
     until_ns: u64,
+    /// Answers that may still come.
+    outstanding: u8,
+    /// A repetition was answered, by whichever answer: not even the same request goes out before the other one came.
+    answered: bool,
+}
+
+impl Unit {
+    /// A request was given up; its answer may come until then.
+    fn suspect(&mut self, pdu: &Pdu, now_ns: u64, until_ns: u64) {
+        let known = self.suspects.iter().position(|s| s.is_active(now_ns) && s.pdu.get() == pdu.get());
+        let at = known.unwrap_or_else(|| {
+            (0..SUSPECTS)
+                .min_by_key(|&i| (self.suspects[i].outstanding > 0, self.suspects[i].until_ns))
+                .unwrap_or(0)
+        });
+        let outstanding = if known.is_some() { self.suspects[at].outstanding.saturating_add(1) } else { 1 };
+        self.suspects[at] = Suspect { pdu: *pdu, until_ns, outstanding, answered: false };
+    }
+
+    /// A frame was discarded: if it is a late answer, that one has come.
+    fn discarded(&mut self, answer: &[u8]) {
+        self.counters.discarded += 1;
+        let late = |s: &&mut Suspect| s.outstanding > 0 && fit(s.pdu.get(), answer) != Fit::No;
+        if let Some(suspect) = self.suspects.iter_mut().find(late) {
+            suspect.outstanding -= 1;
+        }
+    }
+
+    /// A repeated request was answered, perhaps by the late answer to an earlier try: then its own is still to come.
+    fn answered(&mut self, pdu: &Pdu, now_ns: u64, until_ns: u64) {
+        for suspect in self.suspects.iter_mut().filter(|s| s.is_active(now_ns) && s.pdu.get() == pdu.get()) {
+            suspect.until_ns = suspect.until_ns.max(until_ns);
+            suspect.answered = true;
+        }
+    }
+}
+
+impl Suspect {
+    fn is_active(&self, now_ns: u64) -> bool {
+        self.outstanding > 0 && self.until_ns > now_ns
+    }
 }
 
 struct Slot {
@@ -96,6 +140,8 @@ struct Flight {
     begun_ns: u64,
     sent_ns: u64,
     until_ns: u64,
+    /// Bytes came that were no frame: most likely the answer, so none is to come late.
+    damaged: bool,
 }
 
 enum Ended {
@@ -272,7 +318,8 @@ impl Line {
             failed_ns: 0,
             level: 0,
             cost_ns: 0,
-            suspect: None,
+            suspects: [Suspect { pdu: Pdu::new(&[]), until_ns: 0, outstanding: 0, answered: false };
+                SUSPECTS],
             counters: UnitCounters::default(),
             last_exception: None,
             last_rtt_ns: None,
@@ -304,7 +351,7 @@ impl Line {
     /// A frame came from the line, or the answer with the right transaction number from the connection.
     pub fn answer(&mut self, unit: u8, pdu: &[u8], now_ns: u64) {
         let Some(flight) = &self.flight else {
-            self.late(unit);
+            self.late(unit, pdu);
             return;
         };
         let asked = &mut self.units[flight.unit];
@@ -318,10 +365,9 @@ impl Line {
         match fitting {
             Fit::No if self.settings.serial => {
                 if asked.number == unit {
-                    asked.counters.discarded += 1;
-                    asked.suspect = None;
+                    asked.discarded(pdu);
                 } else {
-                    self.late(unit);
+                    self.late(unit, pdu);
                 }
                 return;
             }
@@ -342,19 +388,20 @@ impl Line {
         self.succeed(len, now_ns);
     }
 
-    fn late(&mut self, unit: u8) {
+    fn late(&mut self, unit: u8, pdu: &[u8]) {
         self.counters.late += 1;
         let i = usize::from(self.index[usize::from(unit)]);
         if let Some(unit) = self.units.get_mut(i) {
-            unit.counters.discarded += 1;
-            // What was awaited has come.
-            unit.suspect = None;
+            unit.discarded(pdu);
         }
     }
 
     /// Bytes came that are no frame.
     pub fn garbage(&mut self) {
         self.counters.garbage += 1;
+        if let Some(flight) = self.flight.as_mut().filter(|f| matches!(f.phase, Phase::Waiting)) {
+            flight.damaged = true;
+        }
     }
 
     /// The port or connection does not work: what is in flight fails, and nothing is sent for a while.
@@ -387,6 +434,8 @@ impl Line {
         let Some(flight) = self.flight.take() else { return };
         let rtt_ns = now_ns.saturating_sub(flight.sent_ns.max(flight.begun_ns));
         let unit = &mut self.units[flight.unit];
+        let timeout_ns = unit.settings.response_timeout_ns;
+        unit.answered(&flight.pdu, now_ns, flight.sent_ns.saturating_add(2 * timeout_ns));
         let was_dead = unit.state == UnitState::Dead;
         unit.state = UnitState::Ok;
         (unit.level, unit.cost_ns) = (0, 0);
@@ -437,9 +486,9 @@ impl Line {
         unit.counters.timeouts += u64::from(failure == Failure::NoAnswer);
         let was_dead = unit.state == UnitState::Dead;
         unit.cost_ns = if was_dead { spent_ns } else { unit.cost_ns.saturating_add(spent_ns) };
-        if self.settings.serial && failure == Failure::NoAnswer {
+        if self.settings.serial && failure == Failure::NoAnswer && !flight.damaged {
             let until_ns = now_ns.saturating_add(unit.settings.response_timeout_ns);
-            unit.suspect = Some(Suspect { pdu: flight.pdu, until_ns });
+            unit.suspect(&flight.pdu, now_ns, until_ns);
         }
         let retries = if was_dead { 0 } else { unit.settings.retries };
         let tries = match flight.origin {
@@ -597,11 +646,10 @@ impl Line {
         if state.state == UnitState::Dead && patient {
             free_ns = self.probe_ns(state);
         }
-        if let Some(suspect) = &state.suspect
-            && suspect.until_ns > now_ns
-            && suspect.pdu.confusable(pdu.get())
-        {
-            free_ns = free_ns.max(suspect.until_ns);
+        for suspect in state.suspects.iter().filter(|s| s.is_active(now_ns)) {
+            if suspect.pdu.confusable(pdu.get(), suspect.answered) {
+                free_ns = free_ns.max(suspect.until_ns);
+            }
         }
         Some(free_ns)
     }
@@ -682,6 +730,7 @@ impl Line {
             begun_ns: now_ns,
             sent_ns: 0,
             until_ns,
+            damaged: false,
         });
         Step::Send { unit: state.number, pdu: flight.pdu.get(), origin }
     }

@@ -2,7 +2,7 @@
 
 use super::{LISTENER, RTU_LISTENER, addressing_named};
 use crate::config::Config;
-use crate::map_config::{MapConfig, area_of};
+use crate::map_config::{MapConfig, MapEntry, area_of};
 use crate::process_image::own_inputs;
 use dinrail_iec::{Addressing, parse_address};
 use ipc_types::Wiring;
@@ -56,20 +56,34 @@ pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
 
 /// The ranges of %Q and %M that map tables show. The ready maps show all of both, which is not listed.
 fn shown_ranges(config: &Config, addressing: Addressing) -> Vec<ImageRange> {
-    let MapConfig::Tables(entries) = &config.map else { return Vec::new() };
-    let shown = entries.iter().enumerate().filter_map(|(i, entry)| {
+    let shown = table_entries(config).filter_map(|(unit, key, entry)| {
         let address = parse_address(&entry.area, addressing).ok()?;
         let bytes = if entry.table.is_bits() {
             (u32::from(address.bit.unwrap_or(0)) + entry.count).div_ceil(8)
         } else {
             entry.count * 2
         };
-        let label = format!("{} {}-{}", entry.table.name(), entry.at, entry.at + entry.count - 1);
+        let label = format!("{unit}{} {}-{}", entry.table.name(), entry.at, entry.at + entry.count - 1);
         let area = area_of(address);
-        let range = ImageRange { area, ..image_range(address.byte, bytes, label, format!("map[{i}].area")) };
+        let range = ImageRange { area, ..image_range(address.byte, bytes, label, format!("{key}.area")) };
         (area != Area::Input).then_some(range)
     });
     shown.collect()
+}
+
+/// All map tables, each with the unit it belongs to, as it stands in a label, and its key.
+fn table_entries(config: &Config) -> impl Iterator<Item = (String, String, &MapEntry)> {
+    let common = (String::new(), "map".to_owned(), &config.map);
+    let own = config.unit.iter().enumerate();
+    let own = own.map(|(i, unit)| (format!("unit {} ", unit.id), format!("unit[{i}].map"), &unit.map));
+    std::iter::once(common).chain(own).flat_map(|(unit, key, map)| {
+        let entries: &[MapEntry] = match map {
+            MapConfig::Tables(entries) => entries,
+            MapConfig::Preset(_) => &[],
+        };
+        let entries = entries.iter().enumerate();
+        entries.map(move |(i, entry)| (unit.clone(), format!("{key}[{i}]"), entry))
+    })
 }
 
 fn image_range(byte: u32, bytes: u32, label: String, key: String) -> ImageRange {
@@ -89,21 +103,16 @@ fn image_range(byte: u32, bytes: u32, label: String, key: String) -> ImageRange 
 
 fn own_range(config: &Config, addressing: Addressing, byte: u32, bytes: u32) -> ImageRange {
     // The first table that owns a byte of it; joined neighbours are named by the first.
-    let found = match &config.map {
-        MapConfig::Tables(entries) => entries.iter().enumerate().find(|(_, entry)| {
-            entry.own
-                && parse_address(&entry.area, addressing)
-                    .is_ok_and(|address| area_of(address) == Area::Input && address.byte == byte)
-        }),
-        MapConfig::Preset(_) => None,
-    };
+    let found = table_entries(config).find(|(_, _, entry)| {
+        entry.own
+            && parse_address(&entry.area, addressing)
+                .is_ok_and(|address| area_of(address) == Area::Input && address.byte == byte)
+    });
     let (label, key) = found.map_or_else(
         || ("written by Modbus clients".to_owned(), "map".to_owned()),
-        |(i, entry)| {
-            (
-                format!("{} {}.. written by Modbus clients", entry.table.name(), entry.at),
-                format!("map[{i}].area"),
-            )
+        |(unit, key, entry)| {
+            let label = format!("{unit}{} {}.. written by Modbus clients", entry.table.name(), entry.at);
+            (label, format!("{key}.area"))
         },
     );
     image_range(byte, bytes, label, key)

@@ -286,8 +286,42 @@ impl One<'_> {
                 Err(message) => self.mistakes.add(&format!("{key}.object"), message, "write one of those"),
             }
         }
+        self.sync_writes(device, &mut writes);
         writes.extend(self.error_control_writes(device));
         writes
+    }
+
+    /// What a consumer of the SYNC must know: whether it has a counter (1019h), and how long its window is (1007h).
+    fn sync_writes(&mut self, device: &Device, writes: &mut Vec<Write>) {
+        let config = self.config;
+        if config.sync_period.is_none() {
+            return;
+        }
+        let writable = |index| {
+            let entry = device.od.find(index, 0).ok().and_then(|e| device.od.entry(e));
+            entry.is_some_and(|e| e.access.writable())
+        };
+        let by_hand = |index| {
+            self.node.sdo.iter().any(|w| matches!(w.object.number(), Some((written, _)) if written == index))
+        };
+        if let Some(window) = config.sync_window
+            && writable(0x1007)
+            && !by_hand(0x1007)
+        {
+            let us = u32::try_from(window.ns() / 1000).unwrap_or(u32::MAX);
+            writes.push(Write { index: 0x1007, sub: 0, data: us.to_le_bytes().to_vec() });
+        }
+        if config.sync_overflow == 0 || by_hand(0x1019) {
+            return;
+        }
+        if writable(0x1019) {
+            writes.push(Write { index: 0x1019, sub: 0, data: vec![config.sync_overflow] });
+        } else {
+            let message =
+                format!("node {} knows no SYNC counter: its EDS lacks a writable 1019h", self.node.id);
+            let help = "it answers a SYNC with counter by emergency 8240h; leave sync_overflow out";
+            self.mistakes.warn(&format!("{}.eds", self.key), message, help);
+        }
     }
 
     fn sdo_write(

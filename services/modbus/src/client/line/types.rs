@@ -156,16 +156,9 @@ impl Pdu {
     pub(super) fn get(&self) -> &[u8] {
         &self.bytes[..usize::from(self.len)]
     }
-    /// Whether a late answer to `self` would be taken for one to `other`.
-    pub(super) fn confusable(&self, other: &[u8]) -> bool {
-        // Function and quantity are all that an answer to a read tells of its request.
-        let [f, _, _, q1, q0, ..] = *self.get() else { return false };
-        self.get() != other && matches!(f, 1..=4 | 23) && other.first() == Some(&f) && {
-            let bytes = |q: &[u8]| {
-                let n = usize::from(u16::from_be_bytes([q[0], q[1]]));
-                if f <= 2 { n.div_ceil(8) } else { n * 2 }
-            };
-            other.get(3..5).is_some_and(|q| bytes(q) == bytes(&[q1, q0]))
-        }
+    /// Whether a late answer to `self` would be taken for one to `other`; the same request counts only if `same`.
+    pub(super) fn confusable(&self, other: &[u8], same: bool) -> bool {
+        // The answer to a read tells the quantity only, and an exception nothing but the function.
+        self.get().first() == other.first() && (same || self.get() != other)
     }
 }

@@ -1,0 +1,316 @@
+//! A CANopen network whose nodes are wrong, die and come back: what is done about it, and what the user is shown.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+mod support;
+
+use rustix::process::Signal;
+use support::Stack;
+use support::canopen::{
+    BUS, ErrorControl, HELD, IO401, node, object, said, slave, status, wait_operational, wait_said,
+    wait_said_times, wait_state,
+};
+
+const MASTER: &str = r#"
+[[service]]
+name = "io"
+kind = "canopen-master"
+sync_period = "20ms"
+"#;
+
+const PLC: &str = r#"
+[[service]]
+name = "plc"
+kind = "plc"
+program = ["main.st"]
+cycle = "10ms"
+"#;
+
+const PROGRAM: &str = r"
+PROGRAM main
+VAR
+  Pattern AT %MB0 : USINT := 90;
+  Scans AT %MW2 : UINT;
+  State AT %IB30 : USINT;
+  Quality AT %IB40 : USINT;
+END_VAR
+  Scans := Scans + 1;
+  Lamps := Pattern;
+  Remote := Pattern;
+END_PROGRAM
+";
+
+/// Two nodes; the first shows its lamps at its buttons.
+const NODES: &str = r#"
+[[service.node]]
+id = 2
+eds = "io401.eds"
+mandatory = true
+heartbeat = "100ms"
+status_to = "%IB30"
+map = [
+    { object = "6000:01", to = "%IB0", symbol = "Buttons", status_to = "%IB40" },
+    { object = "6200:01", from = "%QB0", symbol = "Lamps" },
+]
+
+[[service.node]]
+id = 3
+eds = "io401.eds"
+mandatory = true
+heartbeat = "100ms"
+map = [{ object = "6200:01", from = "%QB1", symbol = "Remote" }]
+"#;
+
+fn network(name: &str, master: &str) -> Stack {
+    let nodes = [slave("n2", 2, HELD), slave("n3", 3, HELD)].concat();
+    let toml = [BUS, &nodes, MASTER, master, NODES, PLC].concat();
+    let stack = Stack::up(name, &toml, &[("main.st", PROGRAM), ("io401.eds", IO401)]);
+    wait_operational(&stack, &[2, 3]);
+    wait_exchange(&stack);
+    stack
+}
+
+/// Outputs reach the nodes, and their inputs the program.
+fn wait_exchange(stack: &Stack) {
+    stack.wait("inputs that follow the outputs", || {
+        let pattern = stack.read("Pattern")["value"].as_u64()?;
+        let good = stack.read("Quality")["value"] == 0 && stack.read("State")["value"] == 5;
+        (good && stack.read("Buttons")["value"] == pattern).then_some(())
+    });
+}
+
+/// Only nodes, of which a mandatory one does not boot: never ready.
+fn troubled(name: &str, slaves: &[String], master: &str) -> Stack {
+    let toml = [BUS, &slaves.concat(), MASTER, master].concat();
+    Stack::spawn(name, &toml, &[("io401.eds", IO401)])
+}
+
+fn expected_node(id: u8, more: &str) -> String {
+    format!("\n[[service.node]]\nid = {id}\neds = \"io401.eds\"\nheartbeat = \"100ms\"\n{more}\n")
+}
+
+#[test]
+fn missing_and_wrong_devices_are_named_with_letter_expected_and_got() {
+    let slaves: Vec<String> =
+        [2, 3, 4, 5, 6, 7, 20].iter().map(|&id| slave(&format!("n{id}"), id, "serial_number = 77")).collect();
+    let wrong = [
+        (2, "vendor_id = \"0xBAD\"", "letter D: its vendor (1018h:01)", "expected 0x00000BAD, it has 0x"),
+        (3, "product_code = 9999", "letter M: its product code (1018h:02)", "expected 0x0000270F, it has 0x"),
+        (4, "revision = \"0x90009\"", "letter N: its revision (1018h:03)", "expected 0x00090009, it has 0x"),
+        (5, "serial_number = 78", "letter O: its serial number (1018h:04)", "0x0000004E, it has 0x0000004D"),
+        (6, "device_type = \"0x192\"", "letter C: its device type (1000h)", "0x00000192, it has 0x"),
+    ];
+    let mut master = "boot_time = \"3s\"\nsdo_timeout = \"100ms\"\n".to_owned();
+    for (id, key, ..) in wrong {
+        master += &expected_node(id, key);
+    }
+    master += &expected_node(7, "mandatory = true");
+    master += &expected_node(9, "mandatory = true");
+    let mut stack = troubled("wrongdev", &slaves, &master);
+    for (id, _, letter, values) in wrong {
+        let failure = stack.wait(&format!("why node {id} does not boot"), || {
+            node(&stack, id)?["failure"].as_str().map(str::to_owned)
+        });
+        assert!(failure.contains(letter) && failure.contains(values), "{failure}");
+        wait_said(&stack, "io", &format!("node {id} (Simulated I/O): boot-up failed with {letter}"));
+    }
+    wait_operational(&stack, &[7]);
+    wait_said(&stack, "io", "node 9 (Simulated I/O): boot-up failed with letter B: it does not answer");
+    wait_said(&stack, "io", "node 9 (Simulated I/O) is mandatory and not booted in time; the network is incomplete");
+    wait_said(&stack, "io", "a device with node-id 20 booted, but the stack file has no such node (letter A)");
+    let shown = stack.ok(&["canopen", "status"]);
+    assert!(shown.starts_with("io, node 1, pre-operational: not complete\n"), "{shown}");
+    assert!(shown.contains("node 9: boot-up failed with letter B: "), "{shown}");
+    assert_eq!(stack.service("io").unwrap()["health"], "degraded");
+    // The same trouble is told once, however often it is tried.
+    stack.wait("three tries", || {
+        let failure = node(&stack, 2)?["failure"].as_str()?.to_owned();
+        ["try 1", "try 2,"].iter().all(|t| !failure.contains(t)).then_some(())
+    });
+    assert_eq!(said(&stack, "io").matches("boot-up failed with letter D").count(), 1, "{}", said(&stack, "io"));
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn a_configuration_with_the_right_date_is_not_loaded_again() {
+    let slaves = [slave("n2", 2, "store = \"n2.store\"")];
+    let master =
+        expected_node(2, "mandatory = true\nconfig_date = 100\nconfig_time = 200\nsdo = [{ object = \"2001\", value = 42 }]");
+    let mut stack = troubled("confdate", &slaves, &master);
+    wait_operational(&stack, &[2]);
+    let is = |what: &str, value: &str| {
+        stack.wait(&format!("{what} = {value}"), || (object(&stack, 2, what)? == value).then_some(()));
+    };
+    let boot = |times: usize| {
+        stack.ok(&["canopen", "boot", "2"]);
+        wait_said_times(&stack, "io", "node 2 (Simulated I/O) is booted", times);
+    };
+    let write = |what: &str, value: &str| stack.ok(&["canopen", "sdo", "write", "2", what, value]);
+    let save = || stack.ok(&["canopen", "sdo", "write", "2", "1010:01", "0x65766173"]);
+    // A new device has no date: it was loaded.
+    is("2001", "42");
+    is("1020:01", "100");
+    is("1020:02", "200");
+    // The device keeps its configuration, date and all. A value that the download would change stays.
+    save();
+    write("2001", "7");
+    boot(2);
+    is("2001", "7");
+    // Another time, or another date: loaded.
+    write("1020:02", "201");
+    save();
+    write("2001", "8");
+    boot(3);
+    is("2001", "42");
+    is("1020:02", "200");
+    write("1020:01", "99");
+    save();
+    write("2001", "9");
+    boot(4);
+    is("2001", "42");
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn a_node_that_dies_while_it_is_configured_is_named_and_booted_when_it_is_back() {
+    // Slow enough that the configuration takes seconds.
+    let bus = format!("{BUS}bitrate = \"50k\"\npace = true\n");
+    let writes: Vec<String> =
+        (0..800).map(|i| format!("{{ object = \"2001\", value = {i} }}")).collect();
+    let node2 = expected_node(2, &format!("mandatory = true\nsdo = [{}]", writes.join(", ")));
+    let toml = [bus.as_str(), &slave("n2", 2, HELD), MASTER, &node2].concat().replace("sync_period = \"20ms\"\n", "");
+    let mut stack = Stack::spawn("middown", &toml, &[("io401.eds", IO401)]);
+    stack.wait("the download", || {
+        (node(&stack, 2)?["boot"] == "loading its configuration").then_some(())
+    });
+    stack.kill("n2", Signal::KILL);
+    wait_said(
+        &stack,
+        "io",
+        "node 2 (Simulated I/O): boot-up failed with letter J: its configuration could not be loaded (at 2001:00 Scratch \
+         value) (the node did not answer in time: did it die?); try ",
+    );
+    // It stays away: now it does not even tell its device type.
+    stack.wait("letter B", || (node(&stack, 2)?["letter"] == "B").then_some(()));
+    stack.ok(&["restart", "n2"]);
+    wait_operational(&stack, &[2]);
+    assert_eq!(object(&stack, 2, "2001").as_deref(), Some("799"));
+    assert!(node(&stack, 2).unwrap().get("failure").is_none(), "an old failure is no news");
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn two_devices_with_one_node_id_are_told_by_device_and_master() {
+    let slaves = [slave("n5a", 5, "serial_number = 1"), slave("n5b", 5, "serial_number = 2"), slave("n6", 6, "")];
+    let master = expected_node(5, "") + &expected_node(6, "mandatory = true");
+    let mut stack = troubled("twins", &slaves, &master);
+    wait_operational(&stack, &[6]);
+    wait_said(&stack, "io", "two devices seem to have node-id 5");
+    wait_said(&stack, "n5a", "another device on the bus has node-id 5 too");
+    wait_said(&stack, "n5b", "another device on the bus has node-id 5 too");
+    assert!(!said(&stack, "n6").contains("another device"), "{}", said(&stack, "n6"));
+    assert!(!said(&stack, "io").contains("two devices seem to have node-id 6"), "{}", said(&stack, "io"));
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn a_node_is_pulled_its_inputs_are_stale_and_good_again_when_it_is_back() {
+    let mut stack = network("pulled", "");
+    stack.kill("n2", Signal::KILL);
+    stack.wait("stale inputs", || (stack.read("Quality")["value"] == 1).then_some(()));
+    stack.wait("state unknown to the program", || (stack.read("State")["value"] == 0).then_some(()));
+    assert_eq!(stack.read("Buttons")["value"], 90, "a bad input is held");
+    wait_said(&stack, "io", "node 2 (Simulated I/O) is lost: it sends no heartbeat any more");
+    assert_eq!(node(&stack, 2).unwrap()["state"], "unknown");
+    // The other one goes on.
+    assert_eq!(node(&stack, 3).unwrap()["operational"], true);
+    stack.ok(&["plc", "write", "Pattern=17"]);
+    stack.wait("node 3 follows", || (object(&stack, 3, "6200:01")? == "17").then_some(()));
+    stack.ok(&["restart", "n2"]);
+    wait_operational(&stack, &[2, 3]);
+    wait_exchange(&stack);
+    assert_eq!(stack.read("Buttons")["value"], 17);
+    wait_said_times(&stack, "io", "node 2 (Simulated I/O) is booted", 2);
+    assert_eq!(node(&stack, 2).unwrap()["losses"], 1);
+    assert_eq!(said(&stack, "io").matches("node 3 (Simulated I/O) is booted").count(), 1);
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn a_restarted_master_takes_the_running_network_over_and_boots_what_does_not_run() {
+    let mut stack = network("takeover", "");
+    stack.ok(&["canopen", "nmt", "preop", "3"]);
+    wait_state(&stack, 3, "pre-operational");
+    let watch = ErrorControl::watch(&stack);
+    let generation = stack.generation("io");
+    stack.kill("io", Signal::KILL);
+    stack.wait_generation_above("io", generation);
+    wait_operational(&stack, &[2, 3]);
+    wait_exchange(&stack);
+    wait_said(&stack, "io", "node 2 (Simulated I/O) was running already and is left running");
+    let before = said(&stack, "n2").matches("the device is ").count();
+    assert_eq!((watch.boot_ups(2), watch.boot_ups(3)), (0, 1), "{:?}", watch.frames());
+    // Node 2 was operational in every heartbeat, however long the master was away.
+    assert!(watch.frames().iter().all(|f| !f.starts_with("702#") || f == "702#05"), "{:?}", watch.frames());
+    assert_eq!(said(&stack, "n2").matches("the device is ").count(), before);
+    // And once more, with all of them at work.
+    let generation = stack.generation("io");
+    stack.kill("io", Signal::KILL);
+    stack.wait_generation_above("io", generation);
+    wait_operational(&stack, &[2, 3]);
+    wait_exchange(&stack);
+    assert_eq!((watch.boot_ups(2), watch.boot_ups(3)), (0, 1), "{:?}", watch.frames());
+    drop(watch);
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn the_bus_is_restarted_and_the_network_works_again() {
+    let mut stack = network("busdies", "");
+    let generation = stack.generation("can0");
+    stack.kill("can0", Signal::KILL);
+    stack.wait_generation_above("can0", generation);
+    stack.ok(&["plc", "write", "Pattern=33"]);
+    wait_operational(&stack, &[2, 3]);
+    wait_exchange(&stack);
+    assert_eq!(stack.read("Buttons")["value"], 33);
+    stack.wait("node 3 follows", || (object(&stack, 3, "6200:01")? == "33").then_some(()));
+    let samples = || status(&stack)?["pdo"]["complete_samples"].as_u64();
+    let first = stack.wait("samples", samples);
+    stack.wait("more samples", || (samples()? > first + 5).then_some(()));
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn a_stopped_plc_zeroes_the_outputs_and_the_nodes_stay_operational() {
+    let mut stack = network("plcstop", "");
+    stack.ok(&["plc", "stop"]);
+    wait_said(&stack, "io", "outputs went to their safe state: the PLC is stopped");
+    for id in [2, 3] {
+        stack.wait("outputs zero", || (object(&stack, id, "6200:01")? == "0").then_some(()));
+        assert_eq!(node(&stack, id).unwrap()["operational"], true);
+    }
+    stack.ok(&["plc", "run"]);
+    wait_exchange(&stack);
+    wait_said(&stack, "io", "outputs follow the image again");
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn a_stopped_plc_sends_the_nodes_to_pre_operational_where_on_stop_says_so() {
+    let mut stack = network("plcpreop", "on_stop = \"preop\"\n");
+    stack.ok(&["plc", "stop"]);
+    for id in [2, 3] {
+        wait_state(&stack, id, "pre-operational");
+    }
+    // A node that boots meanwhile goes there, too.
+    stack.kill("n3", Signal::KILL);
+    wait_said(&stack, "io", "node 3 (Simulated I/O) is lost");
+    stack.ok(&["restart", "n3"]);
+    wait_said_times(&stack, "io", "node 3 (Simulated I/O) is booted", 2);
+    wait_state(&stack, 3, "pre-operational");
+    assert!(!said(&stack, "io").contains("instead of"), "{}", said(&stack, "io"));
+    stack.ok(&["plc", "run"]);
+    wait_operational(&stack, &[2, 3]);
+    wait_exchange(&stack);
+    assert_eq!(stack.take_down(), 0);
+}
