@@ -31,6 +31,7 @@ use ipc_types::topic::TopicKind;
 use ipc_types::units::Span;
 use std::io::Write;
 use std::process::ExitCode;
+use std::time::Instant;
 
 pub fn run(command: CanCommand, json: bool) -> anyhow::Result<ExitCode> {
     match command {
