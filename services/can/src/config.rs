@@ -10,11 +10,16 @@ use serde::{Deserialize, Deserializer, Serialize, de};
 
 use crate::feed;
 use crate::protocol::slcan_client::{self, Channel};
-use crate::sys::BAUDS;
 use crate::virtual_bus::{CLIENT_QUEUE, Dialect, MAX_CLIENTS, Settings};
 use crate::wire::filter::{Filters, MAX_FILTERS};
 use crate::wire::netlink::{self, Wanted};
 use crate::wire::port::Target;
+
+/// Rates of SLCAN adapters.
+const BAUDS: [u32; 14] = [
+    9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 500_000, 576_000, 921_600, 1_000_000, 1_500_000,
+    2_000_000, 3_000_000,
+];
 
 /// What stands between this driver and the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -448,7 +453,7 @@ impl Config {
                 "use 1M to 8M in whole M; most adapters have 2M and 5M",
             );
         }
-        if !BAUDS.iter().any(|(rate, _)| *rate == self.baud) {
+        if !BAUDS.contains(&self.baud) {
             error(
                 "baud",
                 format!("a serial port has no rate {}", self.baud),

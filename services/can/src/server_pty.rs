@@ -4,7 +4,7 @@
 //! a time: who opens it finds a closed channel, as on an adapter that was just plugged in.
 
 use std::io;
-use std::os::fd::{AsFd, OwnedFd};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
@@ -12,12 +12,13 @@ use std::time::Duration;
 
 use rustix::fs::inotify;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use rustix::termios::{ControlModes, OptionalActions, tcgetattr, tcsetattr};
 use tokio::io::unix::AsyncFd;
 
 use crate::server::{Host, Hub};
 use crate::virtual_bus::Dialect;
+use crate::watch;
 use crate::wire::port::Port;
-use crate::{sys, watch};
 
 /// What a client that has closed the terminal left behind is used for so long.
 const LAST_WORDS: Duration = Duration::from_millis(50);
@@ -53,7 +54,7 @@ impl Pty {
             .write(true)
             .custom_flags(libc::O_NOCTTY | libc::O_NONBLOCK | libc::O_CLOEXEC)
             .open(&device)?;
-        sys::make_raw(slave.as_fd(), None)?;
+        make_raw(slave.as_fd())?;
         let notify = inotify::init(inotify::CreateFlags::CLOEXEC | inotify::CreateFlags::NONBLOCK)?;
         let events =
             inotify::WatchFlags::OPEN | inotify::WatchFlags::CLOSE_WRITE | inotify::WatchFlags::CLOSE_NOWRITE;
@@ -162,5 +163,35 @@ impl Drop for Pty {
         if std::fs::read_link(&self.link).is_ok_and(|to| to == self.device) {
             let _ = std::fs::remove_file(&self.link);
         }
+    }
+}
+
+/// Makes a terminal a plain pipe of bytes: no echo, no translation.
+fn make_raw(fd: BorrowedFd<'_>) -> io::Result<()> {
+    let mut settings = tcgetattr(fd)?;
+    settings.make_raw();
+    settings.control_modes |= ControlModes::CLOCAL | ControlModes::CREAD;
+    settings.control_modes -= ControlModes::CRTSCTS | ControlModes::CSTOPB;
+    Ok(tcsetattr(fd, OptionalActions::Now, &settings)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_terminal_becomes_a_pipe() {
+        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
+        grantpt(&master).unwrap();
+        unlockpt(&master).unwrap();
+        let name = ptsname(&master, Vec::new()).unwrap();
+        let slave = std::fs::OpenOptions::new().read(true).write(true).open(name.to_str().unwrap()).unwrap();
+        make_raw(slave.as_fd()).unwrap();
+        rustix::io::write(&master, b"a\r\x07\x03").unwrap();
+        let mut bytes = [0; 16];
+        let n = rustix::io::read(&slave, &mut bytes).unwrap();
+        assert_eq!(&bytes[..n], b"a\r\x07\x03");
+        let (pipe, _) = rustix::pipe::pipe().unwrap();
+        assert!(make_raw(pipe.as_fd()).is_err());
     }
 }

@@ -1,4 +1,4 @@
-//! What neither rustix nor the socketcan crate offers: many frames with their marks in one call, and raw terminals.
+//! What neither rustix nor the socketcan crate offers: many frames with their marks in one call.
 #![allow(unsafe_code)]
 
 use std::io;
@@ -150,58 +150,6 @@ fn control(header: &libc::msghdr) -> (Option<u64>, Option<u32>) {
     (utc_ns, drops)
 }
 
-/// Rates that a serial port can be set to.
-pub const BAUDS: [(u32, libc::speed_t); 14] = [
-    (9600, libc::B9600),
-    (19_200, libc::B19200),
-    (38_400, libc::B38400),
-    (57_600, libc::B57600),
-    (115_200, libc::B115200),
-    (230_400, libc::B230400),
-    (460_800, libc::B460800),
-    (500_000, libc::B500000),
-    (576_000, libc::B576000),
-    (921_600, libc::B921600),
-    (1_000_000, libc::B1000000),
-    (1_500_000, libc::B1500000),
-    (2_000_000, libc::B2000000),
-    (3_000_000, libc::B3000000),
-];
-
-/// Makes a terminal a plain pipe of bytes: 8 data bits, no parity, no echo, no translation, no flow control. `baud` sets
-/// its rate; a pseudo-terminal has none.
-pub fn make_raw(fd: BorrowedFd<'_>, baud: Option<u32>) -> io::Result<()> {
-    // SAFETY: termios is plain data that tcgetattr fills in; the descriptor is open for the borrow; cfmakeraw and
-    // cfsetspeed only change the local.
-    unsafe {
-        let mut settings: libc::termios = std::mem::zeroed();
-        if libc::tcgetattr(fd.as_raw_fd(), &raw mut settings) != 0 {
-            return Err(io::Error::last_os_error());
-        }
-        libc::cfmakeraw(&raw mut settings);
-        settings.c_cflag |= libc::CLOCAL | libc::CREAD;
-        settings.c_cflag &= !(libc::CRTSCTS | libc::CSTOPB | libc::PARENB);
-        settings.c_cc[libc::VMIN] = 1;
-        settings.c_cc[libc::VTIME] = 0;
-        if let Some(&(_, speed)) = BAUDS.iter().find(|(rate, _)| Some(*rate) == baud) {
-            libc::cfsetspeed(&raw mut settings, speed);
-        }
-        if libc::tcsetattr(fd.as_raw_fd(), libc::TCSANOW, &raw const settings) != 0 {
-            return Err(io::Error::last_os_error());
-        }
-    }
-    Ok(())
-}
-
-/// Nobody else may open the terminal from now on (except root).
-pub fn exclusive(fd: BorrowedFd<'_>) -> io::Result<()> {
-    // SAFETY: TIOCEXCL takes no argument; the descriptor is open for the borrow.
-    if unsafe { libc::ioctl(fd.as_raw_fd(), libc::TIOCEXCL) } != 0 {
-        return Err(io::Error::last_os_error());
-    }
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -229,24 +177,6 @@ mod tests {
         let got: Vec<_> = batch.items().iter().map(|r| (r.frame, r.own, r.drops)).collect();
         assert_eq!(got, frames.iter().map(|f| (*f, false, None)).collect::<Vec<_>>());
         assert_eq!(receive(b.as_fd(), &mut batch).unwrap_err().kind(), io::ErrorKind::WouldBlock);
-    }
-
-    #[test]
-    fn a_terminal_becomes_a_pipe() {
-        use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
-        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
-        grantpt(&master).unwrap();
-        unlockpt(&master).unwrap();
-        let name = ptsname(&master, Vec::new()).unwrap();
-        let slave = std::fs::OpenOptions::new().read(true).write(true).open(name.to_str().unwrap()).unwrap();
-        make_raw(slave.as_fd(), Some(115_200)).unwrap();
-        exclusive(slave.as_fd()).unwrap();
-        rustix::io::write(&master, b"a\r\x07\x03").unwrap();
-        let mut bytes = [0; 16];
-        let n = rustix::io::read(&slave, &mut bytes).unwrap();
-        assert_eq!(&bytes[..n], b"a\r\x07\x03");
-        let (pipe, _) = rustix::pipe::pipe().unwrap();
-        assert!(make_raw(pipe.as_fd(), None).is_err() && exclusive(pipe.as_fd()).is_err());
     }
 
     proptest! {

@@ -275,6 +275,26 @@ mod tests {
     }
 
     #[test]
+    fn the_group_that_owns_the_device_is_named() {
+        let path = std::env::temp_dir().join(format!("dinrail-group-{}", std::process::id()));
+        fs::write(&path, "").unwrap();
+        let groups = fs::read_to_string("/etc/group").unwrap();
+        let dialout =
+            groups.lines().find_map(|line| line.strip_prefix("dialout:x:")?.split(':').next()?.parse().ok());
+        // Only root may give a file away; else it is the group of this process.
+        let given = dialout.is_some_and(|gid| std::os::unix::fs::chown(&path, None, Some(gid)).is_ok());
+        let group = group_name(fs::metadata(&path).unwrap().gid()).unwrap();
+        assert!(!given || group == "dialout");
+        let remedy = if group == "root" {
+            "it belongs to root alone: a udev rule must give it a group".to_owned()
+        } else {
+            format!("it belongs to group '{group}'; run `sudo usermod -aG {group} $USER`, then log in again")
+        };
+        assert_eq!(permission_remedy(&path), remedy);
+        fs::remove_file(&path).unwrap();
+    }
+
+    #[test]
     fn a_holder_is_found() {
         let null = fs::File::open("/dev/null").unwrap();
         assert!(holders(Path::new("/dev/null")).iter().any(|h| h.pid == std::process::id()));

@@ -1,17 +1,18 @@
 //! A connection that carries bytes: TCP, or a descriptor (serial device, pseudo-terminal).
 
 use std::io;
-use std::os::fd::{AsFd, OwnedFd};
-use std::os::unix::fs::{FileTypeExt, MetadataExt, OpenOptionsExt};
-use std::path::Path;
+use std::os::fd::OwnedFd;
+use std::path::PathBuf;
 use std::time::Duration;
 
+use dinrail_serial::character::{Character, Flow, Parity};
+use dinrail_serial::device::Device;
 use thiserror::Error;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use tokio::net::TcpStream;
 
-use crate::{sys, watch};
+use crate::watch;
 
 /// How long a TCP connection may take.
 const CONNECT: Duration = Duration::from_secs(5);
@@ -72,25 +73,9 @@ pub enum Target {
 /// Why there is no connection.
 #[derive(Debug, Error)]
 pub enum PortError {
-    /// No such device.
-    #[error(
-        "there is no device {0}: plug the adapter in; `ls /dev/serial/by-id` lists serial adapters by a name that stays"
-    )]
-    Absent(String),
-    /// Not permitted.
-    #[error("no permission for {path}: {remedy}")]
-    Permission {
-        /// The device.
-        path: String,
-        /// What to do.
-        remedy: String,
-    },
-    /// In use.
-    #[error("{0} is in use by another program: end it first (`fuser {0}` names it)")]
-    Busy(String),
-    /// Something else than a serial device.
-    #[error("{0} is no serial device")]
-    NotSerial(String),
+    /// The device cannot be used.
+    #[error(transparent)]
+    Device(#[from] dinrail_serial::port::PortError),
     /// Nobody there.
     #[error(
         "cannot connect to {address}: {source}; is the server running, and does the address say host and port?"
@@ -101,13 +86,11 @@ pub enum PortError {
         /// The system's reason.
         source: io::Error,
     },
-    /// Anything else.
-    #[error("{path}: {what}: {source}")]
-    System {
+    /// It cannot be waited for.
+    #[error("{path}: watching it: {source}")]
+    Watch {
         /// The device.
         path: String,
-        /// What was attempted.
-        what: &'static str,
         /// The system's reason.
         source: io::Error,
     },
@@ -126,56 +109,19 @@ impl Target {
                 crate::server::prepare(&stream).map_err(failed)?;
                 Ok(Port::Tcp(stream))
             }
-            Self::Device { path, baud } => device(path, *baud),
+            Self::Device { path, baud } => device(path, *baud).await,
         }
     }
 }
 
-fn device(path: &str, baud: u32) -> Result<Port, PortError> {
-    let system = |what| move |source| PortError::System { path: path.to_owned(), what, source };
-    let file = std::fs::OpenOptions::new()
-        .read(true)
-        .write(true)
-        .custom_flags(libc::O_NOCTTY | libc::O_NONBLOCK | libc::O_CLOEXEC)
-        .open(path)
-        .map_err(|source| match source.kind() {
-            io::ErrorKind::NotFound => PortError::Absent(path.to_owned()),
-            io::ErrorKind::PermissionDenied => permission(path),
-            _ if source.raw_os_error() == Some(libc::EBUSY) => PortError::Busy(path.to_owned()),
-            io::ErrorKind::IsADirectory => PortError::NotSerial(path.to_owned()),
-            _ => system("opening it")(source),
-        })?;
-    if !file.metadata().map_err(system("looking at it"))?.file_type().is_char_device() {
-        return Err(PortError::NotSerial(path.to_owned()));
-    }
-    sys::make_raw(file.as_fd(), Some(baud)).map_err(|source| match source.raw_os_error() {
-        Some(libc::ENOTTY) => PortError::NotSerial(path.to_owned()),
-        _ => system("setting its rate")(source),
-    })?;
-    sys::exclusive(file.as_fd()).map_err(system("taking it for this process alone"))?;
-    let fd = watch::both(OwnedFd::from(file)).map_err(system("watching it"))?;
-    Ok(Port::Tty(fd))
-}
-
-/// The group that owns the device is the one to join.
-fn permission(path: &str) -> PortError {
-    let group = std::fs::metadata(path).ok().map(|m| m.gid()).and_then(group_name);
-    let remedy = match group {
-        Some(group) if group != "root" => {
-            format!("it belongs to group '{group}'; run `sudo usermod -aG {group} $USER`, then log in again")
-        }
-        _ => "it belongs to root alone: a udev rule must give it a group".to_owned(),
-    };
-    PortError::Permission { path: path.to_owned(), remedy }
-}
-
-fn group_name(gid: u32) -> Option<String> {
-    let groups = std::fs::read_to_string(Path::new("/etc/group")).ok()?;
-    groups.lines().find_map(|line| {
-        let mut fields = line.split(':');
-        let name = fields.next()?;
-        (fields.nth(1)?.parse() == Ok(gid)).then(|| name.to_owned())
-    })
+async fn device(path: &str, baud: u32) -> Result<Port, PortError> {
+    let failed = |source| PortError::Watch { path: path.to_owned(), source };
+    let character = Character { baud, data_bits: 8, parity: Parity::None, stop_bits: 1, flow: Flow::None };
+    let device = PathBuf::from(path);
+    // Opening takes its time, and so does the search for who has it.
+    let opening = tokio::task::spawn_blocking(move || Device::open(&device, &character, true));
+    let device = opening.await.map_err(|e| failed(io::Error::other(e)))??;
+    Ok(Port::Tty(watch::both(device.into_fd()).map_err(failed)?))
 }
 
 #[cfg(test)]
@@ -197,46 +143,13 @@ mod tests {
             device("/dev/null"),
             device("/etc/hostname"),
             open(Target::Tcp(closed.to_string())).replace(&closed.port().to_string(), "PORT"),
-            PortError::Busy("/dev/ttyACM0".into()).to_string(),
-            PortError::Permission {
-                path: "/dev/ttyACM0".into(),
-                remedy:
-                    "it belongs to group 'dialout'; run `sudo usermod -aG dialout $USER`, then log in again"
-                        .into(),
-            }
-            .to_string(),
         ];
         insta::assert_snapshot!(all.join("\n"), @r"
-        there is no device /dev/ttyNOTHERE: plug the adapter in; `ls /dev/serial/by-id` lists serial adapters by a name that stays
-        /dev is no serial device
-        /dev/null is no serial device
-        /etc/hostname is no serial device
+        there is no device /dev/ttyNOTHERE: plug the adapter in; `dinrail serial list` lists ports, with names that stay the same
+        /dev is no serial device; `dinrail serial list` lists ports
+        /dev/null is no serial device; `dinrail serial list` lists ports
+        /etc/hostname is no serial device; `dinrail serial list` lists ports
         cannot connect to 127.0.0.1:PORT: Connection refused (os error 111); is the server running, and does the address say host and port?
-        /dev/ttyACM0 is in use by another program: end it first (`fuser /dev/ttyACM0` names it)
-        no permission for /dev/ttyACM0: it belongs to group 'dialout'; run `sudo usermod -aG dialout $USER`, then log in again
         ");
-    }
-
-    #[test]
-    fn the_group_that_owns_the_device_is_named() {
-        let path = std::env::temp_dir().join(format!("dinrail-group-{}", std::process::id()));
-        std::fs::write(&path, "").unwrap();
-        let groups = std::fs::read_to_string("/etc/group").unwrap();
-        let dialout =
-            groups.lines().find_map(|line| line.strip_prefix("dialout:x:")?.split(':').next()?.parse().ok());
-        // Only root may give a file away; else it is the group of this process.
-        let given = dialout.is_some_and(|gid| std::os::unix::fs::chown(&path, None, Some(gid)).is_ok());
-        let group = group_name(std::fs::metadata(&path).unwrap().gid()).unwrap();
-        assert!(!given || group == "dialout");
-        let said = permission(path.to_str().unwrap()).to_string();
-        let remedy = if group == "root" {
-            "it belongs to root alone: a udev rule must give it a group".to_owned()
-        } else {
-            format!("it belongs to group '{group}'; run `sudo usermod -aG {group} $USER`, then log in again")
-        };
-        assert_eq!(said, format!("no permission for {}: {remedy}", path.display()));
-        std::fs::remove_file(&path).unwrap();
-        assert_eq!(group_name(0).as_deref(), Some("root"));
-        assert_eq!(group_name(u32::MAX - 7), None);
     }
 }
