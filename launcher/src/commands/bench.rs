@@ -7,6 +7,7 @@
 mod bus;
 mod bus_full;
 mod bus_peers;
+mod canopen;
 mod demo;
 mod idle;
 mod latency;
@@ -53,6 +54,18 @@ pub enum What {
     Bus,
     /// Modbus TCP answers beside libmodbus and pymodbus, gateway, RTU line
     Modbus,
+    /// SDO, punctuality of the SYNC, process data, a network of 127 nodes
+    Canopen,
+    #[value(hide = true)]
+    CanopenSdo,
+    #[value(hide = true)]
+    CanopenSync,
+    #[value(hide = true)]
+    CanopenSyncFifo,
+    #[value(hide = true)]
+    CanopenPdo,
+    #[value(hide = true)]
+    CanopenNetwork,
     /// A scan of 1000 instructions
     Scan,
     /// Four busy buses, a PLC and the recording
@@ -68,22 +81,32 @@ pub enum What {
 }
 
 impl What {
-    const EACH: [Self; 8] = [
+    const EACH: [Self; 9] = [
         Self::Latency,
         Self::Bus,
         Self::Modbus,
+        Self::Canopen,
         Self::Scan,
         Self::Recorder,
         Self::Start,
         Self::Restart,
         Self::Idle,
     ];
+    /// What `canopen` consists of.
+    const CANOPEN_PARTS: [Self; 5] =
+        [Self::CanopenSdo, Self::CanopenSync, Self::CanopenSyncFifo, Self::CanopenPdo, Self::CanopenNetwork];
 
     fn name(self) -> &'static str {
         match self {
             Self::Latency => "latency",
             Self::Bus => "bus",
             Self::Modbus => "modbus",
+            Self::Canopen => "canopen",
+            Self::CanopenSdo => "canopen-sdo",
+            Self::CanopenSync => "canopen-sync",
+            Self::CanopenSyncFifo => "canopen-sync-fifo",
+            Self::CanopenPdo => "canopen-pdo",
+            Self::CanopenNetwork => "canopen-network",
             Self::Scan => "scan",
             Self::Recorder => "recorder",
             Self::Start => "start",
@@ -205,6 +228,12 @@ fn one(args: &BenchArgs) -> anyhow::Result<Report> {
         What::Latency => latency::run,
         What::Bus => bus::run,
         What::Modbus => modbus::run,
+        What::Canopen => canopen::run,
+        What::CanopenSdo => canopen::sdo,
+        What::CanopenSync => canopen::other,
+        What::CanopenSyncFifo => canopen::fifo,
+        What::CanopenPdo => canopen::process_data,
+        What::CanopenNetwork => canopen::full,
         What::Scan => scan::run,
         What::Recorder => recorder::run,
         What::Start => start::run,
@@ -318,7 +347,7 @@ mod tests {
 
     #[test]
     fn every_bench_is_named_as_on_the_command_line() {
-        for what in What::EACH {
+        for what in What::EACH.into_iter().chain(What::CANOPEN_PARTS) {
             assert_eq!(What::from_str(what.name(), false), Ok(what));
         }
     }

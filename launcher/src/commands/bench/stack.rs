@@ -75,6 +75,13 @@ impl BenchStack {
     /// Writes the files, starts the stack and waits until every service is ready. `NAME` in `stack.toml` becomes
     /// a name of its own.
     pub fn up(parent: &Path, what: &str, toml: &str, files: &[(&str, &str)]) -> anyhow::Result<Self> {
+        let mut stack = Self::up_unready(parent, what, toml, files)?;
+        stack.wait_ready()?;
+        Ok(stack)
+    }
+
+    /// As [`Self::up`], but waits only until every service runs: for those that get ready by what the bench does.
+    pub fn up_unready(parent: &Path, what: &str, toml: &str, files: &[(&str, &str)]) -> anyhow::Result<Self> {
         let name = unique_name(what);
         let scratch = Scratch::new(parent, &name)?;
         scratch.write("stack.toml", &toml.replace("NAME", &name))?;
@@ -82,7 +89,11 @@ impl BenchStack {
             scratch.write(file, text)?;
         }
         let mut stack = Self::spawn(scratch, &name)?;
-        stack.wait_ready()?;
+        stack.wait("every service running", |stack| {
+            let rows = stack.ps().ok()?;
+            (!rows.is_empty() && rows.iter().all(|row| row.state == "running" && row.health != "starting"))
+                .then_some(())
+        })?;
         Ok(stack)
     }
 

@@ -38,6 +38,11 @@ const RETRY_NS: u64 = 1_000_000;
 const MAX_JOBS: usize = 64;
 /// Values of up to so many bytes are not worth a block transfer (protocol switch threshold).
 const SHORT: u8 = 21;
+/// What a node takes of the state of the network, with the reason of a failed boot: 512 bytes are seldom reached.
+const RESULT_BYTES_A_NODE: u32 = 768;
+/// Longest state of the network that is published every second (the limit of `<svc>/status`); a longer one goes
+/// without the reasons of failed boots.
+const STATUS_BYTES: usize = 16_384;
 /// Jobs taken from the rail before other work has its turn.
 const TAKE_JOBS: usize = 16;
 
@@ -52,7 +57,9 @@ pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
             plan.exchange.input_bytes.iter().map(|&n| u32::from(n)).sum::<u32>() + plan.inputs.len() as u32;
         wiring.topics.push(TopicDecl::new(TopicKind::Inputs).max_tail(tail.max(1)));
     }
-    wiring.own(TopicKind::Jobs).own(TopicKind::Results);
+    wiring.own(TopicKind::Jobs);
+    let results = TopicKind::Results.row().max_tail + RESULT_BYTES_A_NODE * config.nodes.len() as u32;
+    wiring.topics.push(TopicDecl::new(TopicKind::Results).max_tail(results));
     wiring.read(TopicKind::Jobs.of(&neighbours.name), true, "");
     if let Some(bus) = neighbours.resolve("can", config.bus.as_deref()) {
         wiring.read(TopicKind::CanRx.of(&bus), true, "bus");
@@ -793,7 +800,13 @@ impl Service {
             self.ctx.event(EventKind::NodeState, Level::Warning, message, Value::Null);
         }
         (self.event_budget, self.events_left_out) = (EVENTS_A_SECOND, 0);
-        let status = self.network_status();
+        let mut status = self.network_status();
+        if status.to_string().len() > STATUS_BYTES {
+            for node in status["nodes"].as_array_mut().into_iter().flatten().filter_map(Value::as_object_mut) {
+                node.remove("failure");
+                node.remove("name");
+            }
+        }
         self.ctx.status(&status);
     }
 }

@@ -1,0 +1,137 @@
+//! Process data of 64 PDOs, and a network of 127 nodes. The nodes are simulated in this process.
+
+use super::super::machine::CpuMeter;
+use super::super::stack::BenchStack;
+use super::super::stats::Samples;
+use super::super::{Bench, Goal};
+use super::{EDS, EDS_FILE, Master, observe, with_fleet};
+use anyhow::{Context as _, ensure};
+use ipc_types::payload::CanFrame;
+use serde_json::{Value, json};
+use std::time::{Duration, Instant};
+
+const SECONDS: u64 = 10;
+const PDOS: u8 = 64;
+/// Node-ids 2 to 127: with the master 127 nodes, the most that a network can have.
+const LAST: u8 = 127;
+const SYNC: u32 = 0x80;
+
+const STACK: &str = r#"
+[stack]
+name = "NAME"
+
+[[service]]
+name = "can0"
+kind = "can"
+backend = "virtual"
+
+[[service]]
+name = "io"
+kind = "canopen-master"
+sync_period = "10ms"
+boot_time = "30s"
+NODES
+
+[[service]]
+name = "plc"
+kind = "plc"
+cycle = "10ms"
+"#;
+
+/// Nodes 2 to `last`, each with a PDO to it and, where `both`, one from it.
+fn text(last: u8, both: bool) -> String {
+    let node = |id: u8| {
+        let at = id - 2;
+        let input = if both { format!("{{ object = \"6000:01\", to = \"%IB{at}\" }}, ") } else { String::new() };
+        let output = format!("{{ object = \"6200:01\", from = \"%QB{at}\" }}");
+        let keys = format!("id = {id}\neds = \"{EDS_FILE}\"\nmandatory = true\nheartbeat = \"1s\"");
+        format!("\n[[service.node]]\n{keys}\nmap = [{input}{output}]\n")
+    };
+    STACK.replace("NODES", &(2..=last).map(node).collect::<String>())
+}
+
+/// From the SYNC on the bus to the last PDO that the master sends for it.
+pub fn process_data(bench: &mut Bench) -> anyhow::Result<()> {
+    let span = Duration::from_secs(bench.seconds(SECONDS));
+    let last = PDOS + 1;
+    let mut stack = BenchStack::up_unready(&bench.dir, "pdo", &text(last, false), &[(EDS_FILE, EDS)])?;
+    {
+        let mut ctx = stack.join()?;
+        let root = ctx.stack.root.clone();
+        let mut rx = ctx.subscriber::<CanFrame>("can0/rx")?;
+        let (mut samples, mut syncs) = (Samples::default(), 0u64);
+        with_fleet(&root, "can0", 2..=last, || {
+            let mut master = Master::open(&mut ctx, "io")?;
+            master.wait_operational(&mut stack, usize::from(PDOS))?;
+            observe(&mut stack, &mut rx, Duration::from_millis(200), |_, _| ())?;
+            let (mut began_ns, mut count) = (None, 0);
+            observe(&mut stack, &mut rx, span, |t_ns, frame| match frame.id() {
+                SYNC => {
+                    (began_ns, count) = (Some(t_ns), 0);
+                    syncs += 1;
+                }
+                // The first RPDO of each node.
+                0x202..=0x27F => {
+                    count += 1;
+                    if let Some(began_ns) = began_ns.filter(|_| count == PDOS) {
+                        samples.push(t_ns.saturating_sub(began_ns) as f64 / 1e3);
+                    }
+                }
+                _ => {}
+            })
+        })?;
+        ensure!(samples.len() > 0, "{PDOS} PDOs were never seen behind one SYNC");
+        bench.info(format!("SYNCs with all {PDOS} PDOs"), samples.len() as f64 / syncs as f64 * 100.0, "%");
+        let samples = samples.sorted();
+        bench.goal(format!("SYNC -> last of {PDOS} PDOs on the bus, p50"), samples.p50(), "us", Goal::Below(200.0));
+        bench.info(format!("SYNC -> last of {PDOS} PDOs on the bus, p99"), samples.p99(), "us");
+    }
+    stack.down()?;
+    Ok(())
+}
+
+/// 127 nodes: from the reset of all to the start of the last, then the CPU of process data both ways.
+pub fn full(bench: &mut Bench) -> anyhow::Result<()> {
+    let span = Duration::from_secs(bench.seconds(SECONDS));
+    let mut stack = BenchStack::up_unready(&bench.dir, "network", &text(LAST, true), &[(EDS_FILE, EDS)])?;
+    {
+        let mut ctx = stack.join()?;
+        let root = ctx.stack.root.clone();
+        let nodes = usize::from(LAST - 1);
+        with_fleet(&root, "can0", 2..=LAST, || {
+            let mut master = Master::open(&mut ctx, "io")?;
+            master.wait_operational(&mut stack, nodes)?;
+            let began = Instant::now();
+            master.ask(&[json!({ "do": "nmt", "command": "reset_communication", "node": 0 })], || ())?;
+            master.wait_operational(&mut stack, nodes)?;
+            bench.info(format!("{} nodes reset and booted, heartbeat 1 s", nodes + 1), began.elapsed().as_secs_f64(), "s");
+            let before = master.status()?;
+            let meter = CpuMeter::start(stack.processes()?);
+            let began = Instant::now();
+            while began.elapsed() < span {
+                std::thread::sleep(Duration::from_millis(50));
+                stack.check()?;
+            }
+            let cpu = meter.stop();
+            let after = master.status()?;
+            let of = |name: &str| cpu.iter().find(|(n, _)| n == name).map_or(f64::NAN, |(_, percent)| *percent);
+            bench.goal(format!("CPU of the master of {} nodes, SYNC 10 ms", nodes + 1), of("io"), "%", Goal::Below(30.0));
+            bench.info("CPU of the bus driver", of("can0"), "%");
+            let grown = |at: &str| Some(count(&after, at)? - count(&before, at)?);
+            let syncs = grown("/network/syncs").context("no counter of SYNCs")?;
+            for (name, at) in [("PDOs from the nodes", "/pdo/rx_pdos"), ("PDOs to the nodes", "/pdo/tx_pdos")] {
+                let got = grown(at).with_context(|| format!("no counter {at}"))?;
+                bench.info(format!("{name}, of one a node and SYNC"), got / (syncs * nodes as f64) * 100.0, "%");
+            }
+            let whole = grown("/pdo/complete_samples").context("no counter of samples")?;
+            bench.info("samples with all PDOs in", whole / syncs * 100.0, "%");
+            Ok(())
+        })?;
+    }
+    stack.down()?;
+    Ok(())
+}
+
+fn count(status: &Value, at: &str) -> Option<f64> {
+    status.pointer(at)?.as_f64()
+}
