@@ -72,9 +72,9 @@ fn network(name: &str, master: &str) -> Stack {
 /// Outputs reach the nodes, and their inputs the program.
 fn wait_exchange(stack: &Stack) {
     stack.wait("inputs that follow the outputs", || {
-        let pattern = stack.read("Pattern")["value"].as_u64()?;
-        let good = stack.read("Quality")["value"] == 0 && stack.read("State")["value"] == 5;
-        (good && stack.read("Buttons")["value"] == pattern).then_some(())
+        let pattern = stack.read("Pattern").as_u64()?;
+        let good = stack.read("Quality") == 0 && stack.read("State") == 5;
+        (good && stack.read("Buttons") == pattern).then_some(())
     });
 }
 
@@ -115,8 +115,16 @@ fn missing_and_wrong_devices_are_named_with_letter_expected_and_got() {
     }
     wait_operational(&stack, &[7]);
     wait_said(&stack, "io", "node 9 (Simulated I/O): boot-up failed with letter B: it does not answer");
-    wait_said(&stack, "io", "node 9 (Simulated I/O) is mandatory and not booted in time; the network is incomplete");
-    wait_said(&stack, "io", "a device with node-id 20 booted, but the stack file has no such node (letter A)");
+    wait_said(
+        &stack,
+        "io",
+        "node 9 (Simulated I/O) is mandatory and not booted in time; the network is incomplete",
+    );
+    wait_said(
+        &stack,
+        "io",
+        "a device with node-id 20 booted, but the stack file has no such node (letter A)",
+    );
     let shown = stack.ok(&["canopen", "status"]);
     assert!(shown.starts_with("io, node 1, pre-operational: not complete\n"), "{shown}");
     assert!(shown.contains("node 9: boot-up failed with letter B: "), "{shown}");
@@ -126,15 +134,22 @@ fn missing_and_wrong_devices_are_named_with_letter_expected_and_got() {
         let failure = node(&stack, 2)?["failure"].as_str()?.to_owned();
         ["try 1", "try 2,"].iter().all(|t| !failure.contains(t)).then_some(())
     });
-    assert_eq!(said(&stack, "io").matches("boot-up failed with letter D").count(), 1, "{}", said(&stack, "io"));
+    assert_eq!(
+        said(&stack, "io").matches("boot-up failed with letter D").count(),
+        1,
+        "{}",
+        said(&stack, "io")
+    );
     assert_eq!(stack.take_down(), 0);
 }
 
 #[test]
 fn a_configuration_with_the_right_date_is_not_loaded_again() {
     let slaves = [slave("n2", 2, "store = \"n2.store\"")];
-    let master =
-        expected_node(2, "mandatory = true\nconfig_date = 100\nconfig_time = 200\nsdo = [{ object = \"2001\", value = 42 }]");
+    let master = expected_node(
+        2,
+        "mandatory = true\nconfig_date = 100\nconfig_time = 200\nsdo = [{ object = \"2001\", value = 42 }]",
+    );
     let mut stack = troubled("confdate", &slaves, &master);
     wait_operational(&stack, &[2]);
     let is = |what: &str, value: &str| {
@@ -174,14 +189,13 @@ fn a_configuration_with_the_right_date_is_not_loaded_again() {
 fn a_node_that_dies_while_it_is_configured_is_named_and_booted_when_it_is_back() {
     // Slow enough that the configuration takes seconds.
     let bus = format!("{BUS}bitrate = \"50k\"\npace = true\n");
-    let writes: Vec<String> =
-        (0..800).map(|i| format!("{{ object = \"2001\", value = {i} }}")).collect();
+    let writes: Vec<String> = (0..800).map(|i| format!("{{ object = \"2001\", value = {i} }}")).collect();
     let node2 = expected_node(2, &format!("mandatory = true\nsdo = [{}]", writes.join(", ")));
-    let toml = [bus.as_str(), &slave("n2", 2, HELD), MASTER, &node2].concat().replace("sync_period = \"20ms\"\n", "");
+    let toml = [bus.as_str(), &slave("n2", 2, HELD), MASTER, &node2]
+        .concat()
+        .replace("sync_period = \"20ms\"\n", "");
     let mut stack = Stack::spawn("middown", &toml, &[("io401.eds", IO401)]);
-    stack.wait("the download", || {
-        (node(&stack, 2)?["boot"] == "loading its configuration").then_some(())
-    });
+    stack.wait("the download", || (node(&stack, 2)?["boot"] == "loading its configuration").then_some(()));
     stack.kill("n2", Signal::KILL);
     wait_said(
         &stack,
@@ -200,7 +214,8 @@ fn a_node_that_dies_while_it_is_configured_is_named_and_booted_when_it_is_back()
 
 #[test]
 fn two_devices_with_one_node_id_are_told_by_device_and_master() {
-    let slaves = [slave("n5a", 5, "serial_number = 1"), slave("n5b", 5, "serial_number = 2"), slave("n6", 6, "")];
+    let slaves =
+        [slave("n5a", 5, "serial_number = 1"), slave("n5b", 5, "serial_number = 2"), slave("n6", 6, "")];
     let master = expected_node(5, "") + &expected_node(6, "mandatory = true");
     let mut stack = troubled("twins", &slaves, &master);
     wait_operational(&stack, &[6]);
@@ -216,9 +231,9 @@ fn two_devices_with_one_node_id_are_told_by_device_and_master() {
 fn a_node_is_pulled_its_inputs_are_stale_and_good_again_when_it_is_back() {
     let mut stack = network("pulled", "");
     stack.kill("n2", Signal::KILL);
-    stack.wait("stale inputs", || (stack.read("Quality")["value"] == 1).then_some(()));
-    stack.wait("state unknown to the program", || (stack.read("State")["value"] == 0).then_some(()));
-    assert_eq!(stack.read("Buttons")["value"], 90, "a bad input is held");
+    stack.wait("stale inputs", || (stack.read("Quality") == 1).then_some(()));
+    stack.wait("state unknown to the program", || (stack.read("State") == 0).then_some(()));
+    assert_eq!(stack.read("Buttons"), 90, "a bad input is held");
     wait_said(&stack, "io", "node 2 (Simulated I/O) is lost: it sends no heartbeat any more");
     assert_eq!(node(&stack, 2).unwrap()["state"], "unknown");
     // The other one goes on.
@@ -228,7 +243,7 @@ fn a_node_is_pulled_its_inputs_are_stale_and_good_again_when_it_is_back() {
     stack.ok(&["restart", "n2"]);
     wait_operational(&stack, &[2, 3]);
     wait_exchange(&stack);
-    assert_eq!(stack.read("Buttons")["value"], 17);
+    assert_eq!(stack.read("Buttons"), 17);
     wait_said_times(&stack, "io", "node 2 (Simulated I/O) is booted", 2);
     assert_eq!(node(&stack, 2).unwrap()["losses"], 1);
     assert_eq!(said(&stack, "io").matches("node 3 (Simulated I/O) is booted").count(), 1);
@@ -272,7 +287,7 @@ fn the_bus_is_restarted_and_the_network_works_again() {
     stack.ok(&["plc", "write", "Pattern=33"]);
     wait_operational(&stack, &[2, 3]);
     wait_exchange(&stack);
-    assert_eq!(stack.read("Buttons")["value"], 33);
+    assert_eq!(stack.read("Buttons"), 33);
     stack.wait("node 3 follows", || (object(&stack, 3, "6200:01")? == "33").then_some(()));
     let samples = || status(&stack)?["pdo"]["complete_samples"].as_u64();
     let first = stack.wait("samples", samples);

@@ -72,13 +72,18 @@ def heartbeat_state(network, node, expected):
     until(f"heartbeat {expected}", lambda: node.nmt.wait_for_heartbeat(PATIENCE) == expected)
 
 
+def reset(network, node, command="RESET"):
+    """The boot-up message may come before python-canopen's own `wait_for_bootup` begins to wait."""
+    network.forget()
+    node.nmt.state = command
+    until("boot-up message", lambda: any(bytes(f.data) == b"\0" for f in network.seen(0x700 + node.id)))
+
+
 def part_nmt(network):
     """States, boot-up message, heartbeat."""
     node = network.node(SIMULATED)
     for command in ("RESET", "RESET COMMUNICATION"):
-        network.forget()
-        node.nmt.state = command
-        until("boot-up message", lambda: any(bytes(f.data) == b"\0" for f in network.seen(0x700 + SIMULATED)))
+        reset(network, node, command)
     node.sdo[0x1017].raw = 20
     for state in ("PRE-OPERATIONAL", "OPERATIONAL", "STOPPED", "PRE-OPERATIONAL", "OPERATIONAL"):
         node.nmt.state = state
@@ -105,8 +110,7 @@ def part_nmt(network):
 def part_heartbeat_consumer(network):
     """The slave watches the master: EMCY 8130h and the error behaviour of 1029h when it is silent, and its return."""
     node = network.node(SIMULATED)
-    node.nmt.state = "RESET COMMUNICATION"
-    node.nmt.wait_for_bootup(PATIENCE)
+    reset(network, node, "RESET COMMUNICATION")
     node.sdo[0x1016][1].raw = (99 << 16) | 100
     node.sdo[0x1017].raw = 20
     node.nmt.state = "OPERATIONAL"
@@ -120,8 +124,7 @@ def part_heartbeat_consumer(network):
     own = network.net.send_periodic(0x700 + 99, b"\x05", 0.02)
     until("EMCY 0000h", lambda: [e for e in node.emcy.log if e.code == 0])
     own.stop()
-    node.nmt.state = "RESET"
-    node.nmt.wait_for_bootup(PATIENCE)
+    reset(network, node)
 
 
 def part_sdo(network):
@@ -190,8 +193,7 @@ def part_megabyte(network):
 
 def fresh(network):
     node = network.node(SIMULATED)
-    node.nmt.state = "RESET"
-    node.nmt.wait_for_bootup(PATIENCE)
+    reset(network, node)
     return node
 
 
@@ -223,8 +225,7 @@ def part_pdo(network):
     synchronous(network, node)
     timed(network, node)
     wrong_length(network, node)
-    node.nmt.state = "RESET"
-    node.nmt.wait_for_bootup(PATIENCE)
+    reset(network, node)
 
 
 def remapped(network, node):
@@ -391,15 +392,13 @@ def guarding(network, node):
     node.nmt.start_node_guarding(0.05)
     until("pre-operational", lambda: node.nmt.state == "PRE-OPERATIONAL")
     node.nmt.stop_node_guarding()
-    node.nmt.state = "RESET"
-    node.nmt.wait_for_bootup(PATIENCE)
+    reset(network, node)
 
 
 def part_device(network):
     """A program of the PLC is the device: its inputs are the outputs of the network and back; EMCY when it stops."""
     node = network.node(DEVICE)
-    node.nmt.state = "RESET"
-    node.nmt.wait_for_bootup(PATIENCE)
+    reset(network, node)
     receive, transmit = outputs(node)
     analogue_out, analogue_in = node.rpdo[2], node.tpdo[2]
     node.nmt.state = "OPERATIONAL"
@@ -417,12 +416,10 @@ def part_device(network):
     node.sdo[0x1015].raw = 500
     node.sdo[0x1010][1].raw = 0x65766173
     aborts(0x08000020, lambda: node.sdo.download(0x1010, 1, b"nope"))
-    node.nmt.state = "RESET"
-    node.nmt.wait_for_bootup(PATIENCE)
+    reset(network, node)
     assert node.sdo[0x1015].raw == 500
     node.sdo[0x1011][1].raw = 0x64616F6C
-    node.nmt.state = "RESET"
-    node.nmt.wait_for_bootup(PATIENCE)
+    reset(network, node)
     assert node.sdo[0x1015].raw == 0
     node.sdo[0x1017].raw = 50
     node.nmt.state = "OPERATIONAL"
@@ -434,8 +431,7 @@ def part_device(network):
     assert node.sdo[0x1003][1].raw & 0xFFFF == 0xFF10
     say("start the plc")
     until("EMCY 0000h", lambda: [e for e in node.emcy.log if e.code == 0])
-    node.nmt.state = "RESET"
-    node.nmt.wait_for_bootup(PATIENCE)
+    reset(network, node)
 
 
 def part_fastscan(network):

@@ -231,7 +231,7 @@ impl Stack {
     pub fn read(&self, variable: &str) -> Value {
         let text = self.ok(&["plc", "read", variable, "--json"]);
         let value: Value = serde_json::from_str(&text).unwrap();
-        value[variable].clone()
+        value["value"].clone()
     }
 
     /// Takes the stack down and gives the launcher's exit code.

@@ -17,6 +17,7 @@ mod modbus_lines;
 mod recorder;
 mod restart;
 mod scan;
+mod soak;
 mod stack;
 mod start;
 mod stats;
@@ -37,7 +38,8 @@ const BUSY_PERCENT: f64 = 10.0;
 pub struct BenchArgs {
     /// What to measure
     pub what: What,
-    /// How long to measure; each bench has a default of its own. `start` and `restart` count runs instead
+    /// How long to measure; each bench has a default of its own. `start` and `restart` count runs instead,
+    /// `soak` ends early
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=3600))]
     pub seconds: Option<u64>,
     /// Folder for scratch files and recordings; default is the system's temporary folder
@@ -76,7 +78,9 @@ pub enum What {
     Restart,
     /// Memory, CPU and recording of a stack without traffic
     Idle,
-    /// All of them, one after the other
+    /// Memory and descriptors under what a Modbus line carries in 24 hours, as fast as it goes
+    Soak,
+    /// All of them but `soak`, one after the other
     All,
 }
 
@@ -112,6 +116,7 @@ impl What {
             Self::Start => "start",
             Self::Restart => "restart",
             Self::Idle => "idle",
+            Self::Soak => "soak",
             Self::All => "all",
         }
     }
@@ -239,6 +244,7 @@ fn one(args: &BenchArgs) -> anyhow::Result<Report> {
         What::Start => start::run,
         What::Restart => restart::run,
         What::Idle => idle::run,
+        What::Soak => soak::run,
         What::All => anyhow::bail!("'all' is no bench of its own"),
     };
     let meter = MachineMeter::start();

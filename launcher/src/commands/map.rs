@@ -226,13 +226,7 @@ fn registers(shown: &Shown, (area, byte, bit): (Area, u32, Option<u8>)) -> Vec<R
     entries.map(|entry| register(entry, Some(if swapped(entry) { bit ^ 8 } else { bit }))).collect()
 }
 
-fn point(
-    plc: &ServiceEntry,
-    entry: &ServiceEntry,
-    range: &ImageRange,
-    role: Role,
-    maps: &[Shown],
-) -> Point {
+fn point(plc: &ServiceEntry, entry: &ServiceEntry, range: &ImageRange, role: Role, maps: &[Shown]) -> Point {
     let at = LocatedAddress::new(range.area.letter(), range.byte, range.bit, range.bytes);
     let modbus = maps.iter().flat_map(|map| registers(map, (range.area, range.byte, range.bit))).collect();
     Point {
@@ -395,7 +389,7 @@ mod tests {
         let shown = points.iter().map(|p| row(p).join(" | ")).find(|row| row.contains("%MD10")).unwrap();
         assert_eq!(
             shown,
-            "%MD10 | %MD40 | %MB40 to %MB43 | - | - | holding_registers 20 (40021), unit 5 holding_registers 8 (40009) | unit 5 holding_registers 7-8 | to modbus"
+            "%MD10 | %MD40 | %MB40 to %MB43 | - | - | holding_registers 20 (40021), unit 5 holding_registers 7 (40008) | unit 5 holding_registers 7-8 | to modbus"
         );
         let shown = text(&points, &servers);
         assert!(shown.contains("\nregisters of unit 5 of 'modbus' over the image of 'plc'\n"), "{shown}");

@@ -32,20 +32,18 @@ pub enum JobError {
 pub fn choose(ctx: &Context, kind: &str, named: Option<&str>) -> anyhow::Result<String> {
     let list: Vec<&str> =
         ctx.stack.services.iter().filter(|s| s.kind == kind).map(|s| s.name.as_str()).collect();
-    match (named, list.as_slice()) {
-        (_, []) => anyhow::bail!("stack '{}' has no {kind} service", ctx.stack.name),
+    choose_of(&ctx.stack.name, kind, &list, named)
+}
+
+fn choose_of(stack: &str, kind: &str, list: &[&str], named: Option<&str>) -> anyhow::Result<String> {
+    match (named, list) {
+        (_, []) => anyhow::bail!("stack '{stack}' has no {kind} service"),
         (Some(name), list) if list.contains(&name) => Ok(name.to_owned()),
         (Some(name), list) => {
-            anyhow::bail!(
-                "stack '{}' has no {kind} service '{name}'; it has {}",
-                ctx.stack.name,
-                list.join(", ")
-            )
+            anyhow::bail!("stack '{stack}' has no {kind} service '{name}'; it has {}", list.join(", "))
         }
         (None, [only]) => Ok((*only).to_owned()),
-        (None, list) => {
-            anyhow::bail!("several {kind} services: {}; say which one with --service NAME", list.join(", "))
-        }
+        (None, list) => anyhow::bail!("several {kind} services: {}; say which one", list.join(", ")),
     }
 }
 
@@ -200,6 +198,16 @@ impl JobLine {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_only_one_is_meant_and_several_are_listed() {
+        assert_eq!(choose_of("s", "plc", &["a"], None).unwrap(), "a");
+        assert_eq!(choose_of("s", "plc", &["a", "b"], Some("b")).unwrap(), "b");
+        let error = |list: &[&str], named| choose_of("s", "plc", list, named).unwrap_err().to_string();
+        assert_eq!(error(&[], None), "stack 's' has no plc service");
+        assert_eq!(error(&["a", "b"], None), "several plc services: a, b; say which one");
+        assert_eq!(error(&["a"], Some("c")), "stack 's' has no plc service 'c'; it has a");
+    }
 
     #[test]
     fn a_job_goes_once_to_each_generation() {

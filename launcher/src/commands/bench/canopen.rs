@@ -43,7 +43,8 @@ pub fn run(bench: &mut Bench) -> anyhow::Result<()> {
         }
         let output = child.arg("--dir").arg(&bench.dir).output().context("starting a part of the bench")?;
         ensure!(output.status.success(), "{} could not be run, {}; see above", part.name(), output.status);
-        let report: Report = serde_json::from_slice(&output.stdout).context("reading the report of a part")?;
+        let report: Report =
+            serde_json::from_slice(&output.stdout).context("reading the report of a part")?;
         let own = |mut figure: super::Figure| {
             bench.what.name().clone_into(&mut figure.bench);
             figure
@@ -148,7 +149,10 @@ fn with_fleet<T>(
         let done = work();
         stop.store(true, Ordering::Relaxed);
         let dropped = player.join().map_err(|_| anyhow::anyhow!("the simulated nodes panicked"))??;
-        ensure!(dropped == 0 || done.is_err(), "the simulated nodes lost {dropped} frames: the bus did not take them");
+        ensure!(
+            dropped == 0 || done.is_err(),
+            "the simulated nodes lost {dropped} frames: the bus did not take them"
+        );
         done
     })
 }

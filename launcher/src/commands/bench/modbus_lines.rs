@@ -81,14 +81,14 @@ period = "0s"
 "#;
 
 /// A unit that answers reads of holding registers at once; ends when dropped.
-struct Unit {
+pub(super) struct Unit {
     stop: Arc<AtomicBool>,
-    answered: Arc<AtomicU64>,
+    pub(super) answered: Arc<AtomicU64>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Unit {
-    fn start(line: &Path) -> anyhow::Result<Self> {
+    pub(super) fn start(line: &Path) -> anyhow::Result<Self> {
         let mut config = SerialConfig::of_device(&line.display().to_string());
         config.verify = false;
         config.exclusive = false;

@@ -202,7 +202,8 @@ impl BenchStack {
         }
     }
 
-    fn leftovers(&self) -> Vec<String> {
+    /// Names of the stack's objects in shared memory.
+    pub fn leftovers(&self) -> Vec<String> {
         let own = self.prefix.trim_end_matches('_');
         let entries = fs::read_dir("/dev/shm").into_iter().flatten().flatten();
         let names = entries.map(|e| e.file_name().to_string_lossy().into_owned());

@@ -3,10 +3,12 @@
 use crate::cli::Which;
 use crate::commands::{println, table};
 use crate::supervise::client::{find, observe};
+use crate::supervise::jobs::{JobLine, choose};
+use crate::supervise::state_dir::RunningStack;
 use clap::Args;
-use ipc_types::payload::{Job, JobResult, Status};
+use ipc_types::Context;
+use ipc_types::payload::Status;
 use ipc_types::topic::TopicKind;
-use ipc_types::{Context, clock};
 use serde_json::{Value, json};
 use std::time::{Duration, Instant};
 
@@ -27,7 +29,7 @@ pub struct ServerArgs {
 
 /// Lists the clients that are connected now.
 pub fn clients(args: &ServerArgs, json: bool) -> anyhow::Result<()> {
-    let (ctx, service) = open(args)?;
+    let (ctx, _, service) = open(args)?;
     let status = status(&ctx, &service)?;
     let list = status.get("client_list").and_then(Value::as_array).cloned().unwrap_or_default();
     let count = status.get("clients").and_then(Value::as_u64).unwrap_or(0);
@@ -69,35 +71,9 @@ fn text(list: &[Value]) -> String {
 
 /// Switches a server on or off until the next command or its restart.
 pub fn switch(args: &ServerArgs, on: bool, json: bool) -> anyhow::Result<()> {
-    let (mut ctx, service) = open(args)?;
-    // First the ear, then the mouth: the answer may come at once.
-    let mut results = ctx.subscriber::<JobResult>(&TopicKind::Results.of(&service))?;
-    let mut jobs = ctx.publisher::<Job>(&TopicKind::Jobs.of(&service))?;
-    let header = Job { deadline_t_ns: clock::mono_ns() + LIMIT.as_nanos() as u64, ..Job::default() };
+    let (mut ctx, running, service) = open(args)?;
     let order = json!({ "do": if on { "enable" } else { "disable" } });
-    let seq = jobs.send_tail(header, &serde_json::to_vec(&order)?)?;
-    jobs.ring();
-    let begin = Instant::now();
-    loop {
-        let mut answer = None;
-        results.drain(64, |result, tail| {
-            if result.job_seq == seq && result.job_writer == ctx.writer {
-                answer = Some((result.code, serde_json::from_slice::<Value>(tail).unwrap_or(Value::Null)));
-            }
-        });
-        match answer {
-            Some((0, _)) => break,
-            Some((_, body)) => {
-                let error = body.get("error").and_then(Value::as_str).unwrap_or("it failed");
-                anyhow::bail!("modbus-server '{service}': {error}");
-            }
-            None if begin.elapsed() > LIMIT => anyhow::bail!(
-                "modbus-server '{service}' did not answer within {} s; see `dinrail ps`",
-                LIMIT.as_secs()
-            ),
-            None => std::thread::sleep(LOOK),
-        }
-    }
+    JobLine::open(&mut ctx, running, KIND, &service)?.ask(&order, LIMIT)?;
     if json {
         println(&json!({ "service": service, "wanted": on }).to_string());
     } else {
@@ -107,25 +83,11 @@ pub fn switch(args: &ServerArgs, on: bool, json: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn open(args: &ServerArgs) -> anyhow::Result<(Context, String)> {
-    let ctx = observe(&find(args.which.stack.as_deref())?)?;
-    let names: Vec<String> =
-        ctx.stack.services.iter().filter(|s| s.kind == KIND).map(|s| s.name.clone()).collect();
-    let service = choose(&ctx.stack.name, &names, args.service.as_deref())?;
-    Ok((ctx, service))
-}
-
-/// The server of this name, or the only one.
-fn choose(stack: &str, names: &[String], named: Option<&str>) -> anyhow::Result<String> {
-    match (named, names) {
-        (_, []) => anyhow::bail!("stack '{stack}' has no modbus-server"),
-        (Some(name), names) if names.iter().any(|n| n == name) => Ok(name.to_owned()),
-        (Some(name), names) => {
-            anyhow::bail!("stack '{stack}' has no modbus-server '{name}'; it has {}", names.join(", "))
-        }
-        (None, [only]) => Ok(only.clone()),
-        (None, names) => anyhow::bail!("several modbus-servers: {}; name one of them", names.join(", ")),
-    }
+fn open(args: &ServerArgs) -> anyhow::Result<(Context, RunningStack, String)> {
+    let running = find(args.which.stack.as_deref())?;
+    let ctx = observe(&running)?;
+    let service = choose(&ctx, KIND, args.service.as_deref())?;
+    Ok((ctx, running, service))
 }
 
 /// The newest status. The server sends it every second.
@@ -159,16 +121,5 @@ mod tests {
             "ADDRESS   PORT   CONNECTED  IDLE  REQUESTS  EXCEPTIONS  UNIT  FUNCTION\n\
              10.0.0.7  50123  12 s       0 s   7         1           1     3\n"
         );
-    }
-
-    #[test]
-    fn the_server_meant() {
-        let names = |list: &[&str]| list.iter().map(|n| (*n).to_owned()).collect::<Vec<_>>();
-        assert_eq!(choose("s", &names(&["a"]), None).unwrap(), "a");
-        assert_eq!(choose("s", &names(&["a", "b"]), Some("b")).unwrap(), "b");
-        let error = |list: &[&str], named| choose("s", &names(list), named).unwrap_err().to_string();
-        assert_eq!(error(&[], None), "stack 's' has no modbus-server");
-        assert_eq!(error(&["a", "b"], None), "several modbus-servers: a, b; name one of them");
-        assert_eq!(error(&["a"], Some("x")), "stack 's' has no modbus-server 'x'; it has a");
     }
 }

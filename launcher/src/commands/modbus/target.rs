@@ -3,6 +3,7 @@
 use super::MasterArgs;
 use crate::commands::UsageError;
 use crate::supervise::client::{find, observe};
+use crate::supervise::jobs::{JobError, JobLine, choose};
 use anyhow::Context as _;
 use dinrail_modbus::client::ask::{Ask, exception_words};
 use dinrail_modbus::protocol::client_fit::{Fit, Length, fit, length};
@@ -10,10 +11,6 @@ use dinrail_modbus::protocol::mbap::{self, Scan};
 use dinrail_modbus::protocol::{ascii, rtu};
 use dinrail_serial::config::{Config as SerialConfig, Framing};
 use dinrail_serial::port::{Port, Read as PortRead};
-use ipc_types::clock;
-use ipc_types::payload::{Job, JobResult};
-use ipc_types::port::{Publisher, Subscriber};
-use ipc_types::topic::TopicKind;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use serde_json::Value;
 use std::io::{Read, Write};
@@ -21,8 +18,8 @@ use std::net::{TcpStream, ToSocketAddrs};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// How often the results of a service are looked at: tools have no inbox.
-const LOOK: Duration = Duration::from_millis(1);
+/// Services that carry out any function.
+const KIND: &str = "modbus-client";
 /// Longer than the service's own limits, which it reports better.
 const SERVICE_LIMIT: Duration = Duration::from_secs(20);
 
@@ -47,7 +44,7 @@ enum Wire {
     Tcp { stream: TcpStream, transaction: u16 },
     RtuOverTcp(TcpStream),
     Serial { port: Port, ascii: bool, char_ns: u64, t35: Duration },
-    Service { name: String, writer: u32, jobs: Publisher<Job>, results: Subscriber<JobResult> },
+    Service { name: String, line: Box<JobLine> },
 }
 
 /// A master with its unit.
@@ -100,10 +97,10 @@ impl Master {
     /// The same to another unit.
     pub fn ask_unit(&mut self, unit: &Value, job: &Value) -> Result<Value, Failed> {
         let ask = Ask::from_json(job).map_err(|e| Failed::Other(e.to_string()))?;
-        if let Wire::Service { name, writer, jobs, results } = &mut self.wire {
+        if let Wire::Service { line, .. } = &mut self.wire {
             let mut job = job.clone();
             job["unit"] = unit.clone();
-            return through_service(name, *writer, jobs, results, &job);
+            return through_service(line, &job);
         }
         let unit = unit.as_u64().unwrap_or(0) as u8;
         let mut last = Failed::NoAnswer("no answer".to_owned());
@@ -261,61 +258,26 @@ fn serial(text: &str, ascii: bool) -> anyhow::Result<Wire> {
 }
 
 fn service(name: &str, stack: Option<&str>) -> anyhow::Result<Wire> {
-    let mut ctx = observe(&find(stack)?).context("asking a modbus-client of a running stack")?;
-    let known: Vec<&str> =
-        ctx.stack.services.iter().filter(|s| s.kind == "modbus-client").map(|s| s.name.as_str()).collect();
-    if !known.contains(&name) {
-        let list = if known.is_empty() { "none".to_owned() } else { known.join(", ") };
-        anyhow::bail!(
-            "stack '{}' has no modbus-client '{name}'; it has {list}. A device is written tcp://HOST or rtu:///dev/...",
-            ctx.stack.name
-        );
-    }
-    // First the ear, then the mouth: the answer may come at once.
-    let results = ctx.subscriber::<JobResult>(&TopicKind::Results.of(name))?;
-    let jobs = ctx.publisher::<Job>(&TopicKind::Jobs.of(name))?;
-    Ok(Wire::Service { name: name.to_owned(), writer: ctx.writer, jobs, results })
+    let running = find(stack)?;
+    let mut ctx = observe(&running).context("asking a modbus-client of a running stack")?;
+    let service = choose(&ctx, KIND, Some(name))
+        .map_err(|e| anyhow::anyhow!("{e}. A device is written tcp://HOST or rtu:///dev/..."))?;
+    let line = Box::new(JobLine::open(&mut ctx, running, KIND, &service)?);
+    Ok(Wire::Service { name: service, line })
 }
 
-fn through_service(
-    name: &str,
-    writer: u32,
-    jobs: &mut Publisher<Job>,
-    results: &mut Subscriber<JobResult>,
-    job: &Value,
-) -> Result<Value, Failed> {
-    let other = |e: &dyn std::fmt::Display| Failed::Other(e.to_string());
-    let header = Job { deadline_t_ns: clock::mono_ns() + SERVICE_LIMIT.as_nanos() as u64, ..Job::default() };
-    let text = serde_json::to_vec(job).map_err(|e| other(&e))?;
-    let seq = jobs.send_tail(header, &text).map_err(|e| other(&e))?;
-    jobs.ring();
-    let begin = Instant::now();
-    loop {
-        let mut answer = None;
-        results.drain(64, |result, tail| {
-            if result.job_seq == seq && result.job_writer == writer {
-                answer = Some((result.code, serde_json::from_slice::<Value>(tail).unwrap_or(Value::Null)));
-            }
-        });
-        match answer {
-            Some((0, body)) => return Ok(body.get("ok").cloned().unwrap_or(body)),
-            Some((_, body)) => {
-                let text = body.get("error").and_then(Value::as_str).unwrap_or("it failed").to_owned();
-                let code = text
-                    .strip_prefix("exception ")
-                    .and_then(|rest| u8::from_str_radix(rest.get(..2)?, 16).ok());
-                return Err(match code {
-                    Some(code) => Failed::Exception(code, text),
-                    None if text.starts_with("no answer") => Failed::NoAnswer(text),
-                    None => Failed::Other(text),
-                });
-            }
-            None if begin.elapsed() > SERVICE_LIMIT => {
-                return Err(Failed::Other(format!("service '{name}' did not answer; see `dinrail ps`")));
-            }
-            None => std::thread::sleep(LOOK),
-        }
-    }
+fn through_service(line: &mut JobLine, job: &Value) -> Result<Value, Failed> {
+    let text = match line.ask(job, SERVICE_LIMIT) {
+        Ok(value) => return Ok(value),
+        Err(JobError::Refused { text, .. }) => text,
+        Err(other) => return Err(Failed::Other(other.to_string())),
+    };
+    let code = text.strip_prefix("exception ").and_then(|rest| u8::from_str_radix(rest.get(..2)?, 16).ok());
+    Err(match code {
+        Some(code) => Failed::Exception(code, text),
+        None if text.starts_with("no answer") => Failed::NoAnswer(text),
+        None => Failed::Other(text),
+    })
 }
 
 /// Reads until `found` has something or the time is over.

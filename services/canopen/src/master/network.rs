@@ -37,6 +37,12 @@ const RESTART_NS: u64 = 1_000_000_000;
 /// State changes without command within [`DUPLICATE_NS`] that only two devices can make.
 const DUPLICATE_CHANGES: u8 = 4;
 const DUPLICATE_NS: u64 = 2_000_000_000;
+/// Heartbeats within [`BEATS_PERIODS`] periods that only two devices can send: one sends 8, and a few with its changes
+/// of state.
+const DUPLICATE_BEATS: u8 = 14;
+const BEATS_PERIODS: u64 = 8;
+/// Emergency code of a device that hears its own identifiers (CiA 301 V4.2, table 26).
+const EMCY_COLLISION: u16 = 0x8150;
 
 /// How the network is run.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -110,6 +116,7 @@ pub enum Event {
     /// Two devices seem to have this node-id.
     Duplicate {
         node: u8,
+        sign: Sign,
     },
     /// Mandatory nodes were not booted in time; the first of them.
     MandatoryMissing {
@@ -120,6 +127,17 @@ pub enum Event {
     NetworkStarted,
     BusOff,
     BusBack,
+}
+
+/// What tells that two devices have one node-id.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Sign {
+    /// States without command, or boot-up messages in a row.
+    States,
+    /// Twice as many heartbeats as asked for.
+    Heartbeats,
+    /// The devices say so.
+    Emcy,
 }
 
 /// What is known of a node.
@@ -140,6 +158,8 @@ pub struct NodeRun {
     restart_at_ns: Option<u64>,
     changes: u8,
     changes_since_ns: u64,
+    beats: u8,
+    beats_since_ns: u64,
     told_duplicate: bool,
 }
 
@@ -176,6 +196,8 @@ impl NodeRun {
             restart_at_ns: None,
             changes: 0,
             changes_since_ns: 0,
+            beats: 0,
+            beats_since_ns: 0,
             told_duplicate: false,
         }
     }
@@ -490,6 +512,8 @@ impl Network {
         }
         let before = node.state.replace(state);
         node.boot.on_alive(t_ns, state);
+        self.count_beat(t_ns, i);
+        let node = &mut self.nodes[i];
         if before.is_some_and(|before| before != state) {
             self.count_change(t_ns, i);
         }
@@ -516,10 +540,30 @@ impl Network {
             (node.changes, node.changes_since_ns) = (0, t_ns);
         }
         node.changes = node.changes.saturating_add(1);
-        if node.changes >= DUPLICATE_CHANGES && !node.told_duplicate {
-            node.told_duplicate = true;
+        if node.changes >= DUPLICATE_CHANGES {
+            self.tell_duplicate(i, Sign::States);
+        }
+    }
+
+    /// Two devices with one node-id send twice the heartbeats that one was told to send.
+    fn count_beat(&mut self, t_ns: u64, i: usize) {
+        let node = &mut self.nodes[i];
+        let ErrorControl::Heartbeat { consumer_ns } = node.settings.plan.error_control else { return };
+        // The consumer time is three periods.
+        if t_ns.saturating_sub(node.beats_since_ns) > consumer_ns / 3 * BEATS_PERIODS {
+            (node.beats, node.beats_since_ns) = (0, t_ns);
+        }
+        node.beats = node.beats.saturating_add(1);
+        if node.beats >= DUPLICATE_BEATS && node.boot.is_running() {
+            self.tell_duplicate(i, Sign::Heartbeats);
+        }
+    }
+
+    fn tell_duplicate(&mut self, i: usize, sign: Sign) {
+        let node = &mut self.nodes[i];
+        if !std::mem::replace(&mut node.told_duplicate, true) {
             let node = node.id();
-            self.tell(Event::Duplicate { node });
+            self.tell(Event::Duplicate { node, sign });
         }
     }
 
@@ -550,6 +594,9 @@ impl Network {
         node.emcys += 1;
         node.last_emcy = Some((code, register));
         self.tell(Event::Emcy { node: id, code, register, vendor: bytes });
+        if code == EMCY_COLLISION {
+            self.tell_duplicate(i, Sign::Emcy);
+        }
     }
 
     /// Whatever time has brought. Sends SYNC first, so that nothing delays it.

@@ -263,7 +263,7 @@ fn two_devices_with_one_node_id_are_found() {
         bus.run(30);
         bus.send(9, heartbeat(2, 127));
     }
-    assert!(bus.said().contains("Duplicate { node: 2 }"));
+    assert!(bus.said().contains("Duplicate { node: 2, sign: States }"));
 }
 
 fn heartbeat(node: u32, state: u8) -> CanFrame {

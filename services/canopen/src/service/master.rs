@@ -212,6 +212,7 @@ pub fn run(mut ctx: Context) -> Result<(), RunError> {
         events_left_out: 0,
         asked: BTreeMap::new(),
         next_job: 0,
+        sync_out_ns: (0, 0),
     };
     service.begin();
     service.work(&mut reactor, &mut inbox, &wakes)
@@ -260,6 +261,8 @@ struct Service {
     events_left_out: u32,
     asked: BTreeMap<u64, Asked>,
     next_job: u64,
+    /// From the SYNC to its last PDO in the driver's queue: the last time, and the longest.
+    sync_out_ns: (u64, u64),
 }
 
 impl Service {
@@ -290,8 +293,7 @@ impl Service {
                 }
             }
             // The SYNC goes before everything else.
-            self.network.sync(clock::mono_ns(), &mut self.out);
-            self.send();
+            self.sync();
             if rang {
                 inbox.drain();
             }
@@ -333,6 +335,17 @@ impl Service {
         let next = self.network.next_deadline().into_iter().chain(stale_ns).chain(retry_ns).min();
         // Never in the past: the clock would ring for ever.
         next.map(|at_ns| at_ns.max(now_ns + 1))
+    }
+
+    /// The SYNC and its PDOs, if it is due.
+    fn sync(&mut self) {
+        let (began_ns, before) = (clock::mono_ns(), self.network.counters().syncs);
+        self.network.sync(began_ns, &mut self.out);
+        self.send();
+        if self.network.counters().syncs > before {
+            let out_ns = clock::mono_ns().saturating_sub(began_ns);
+            self.sync_out_ns = (out_ns, self.sync_out_ns.1.max(out_ns));
+        }
     }
 
     fn on_time(&mut self) {
@@ -787,6 +800,7 @@ impl Service {
             "nodes": self.network.nodes().iter().map(|n| self.node_status(n)).collect::<Vec<_>>(),
             "network": self.network.counters(),
             "pdo": self.network.exchange.counters(),
+            "sync_out_us": { "last": self.sync_out_ns.0 / 1000, "max": self.sync_out_ns.1 / 1000 },
             "frames_dropped": self.dropped,
             "frames_waiting": self.waiting.len(),
             "safe": self.safe.filter(|_| self.image.is_some()),

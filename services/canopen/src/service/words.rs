@@ -1,7 +1,7 @@
 //! What the network did, in sentences for people.
 
 use crate::master::boot::Failure;
-use crate::master::network::{Event, state_name};
+use crate::master::network::{Event, Sign, state_name};
 use crate::protocol::abort::Abort;
 use ipc_types::event::{EventKind, Level};
 use serde_json::{Value, json};
@@ -85,10 +85,13 @@ pub fn event(
             );
             (node_state, Level::Warning, text, json!({ "node": node, "letter": "A" }))
         }
-        Event::Duplicate { node } => {
-            let text = format!(
-                "two devices seem to have node-id {node}: its state changes to and fro without command; give one of them another"
-            );
+        Event::Duplicate { node, sign } => {
+            let sign = match sign {
+                Sign::States => "its state changes to and fro without command",
+                Sign::Heartbeats => "twice as many heartbeats come as one device was told to send",
+                Sign::Emcy => "one of them hears the other (emergency 8150h)",
+            };
+            let text = format!("two devices seem to have node-id {node}: {sign}; give one of them another");
             (node_state, Level::Fault, text, json!({ "node": node }))
         }
         Event::MandatoryMissing { node, missing } => {
@@ -188,7 +191,9 @@ mod tests {
             Event::Emcy { node: 5, code: 0x8210, register: 0x11, vendor: [1, 2, 3, 4, 5] },
             Event::Emcy { node: 5, code: 0, register: 0, vendor: [0; 5] },
             Event::Unknown { node: 9 },
-            Event::Duplicate { node: 5 },
+            Event::Duplicate { node: 5, sign: Sign::States },
+            Event::Duplicate { node: 5, sign: Sign::Heartbeats },
+            Event::Duplicate { node: 5, sign: Sign::Emcy },
             Event::MandatoryMissing { node: 5, missing: 2 },
             Event::NetworkStarted,
             Event::BusOff,

@@ -15,6 +15,8 @@ const PDOS: u8 = 64;
 /// Node-ids 2 to 127: with the master 127 nodes, the most that a network can have.
 const LAST: u8 = 127;
 const SYNC: u32 = 0x80;
+/// From one question for the master's figure to the next.
+const LOOK: Duration = Duration::from_millis(25);
 
 const STACK: &str = r#"
 [stack]
@@ -42,7 +44,8 @@ cycle = "10ms"
 fn text(last: u8, both: bool) -> String {
     let node = |id: u8| {
         let at = id - 2;
-        let input = if both { format!("{{ object = \"6000:01\", to = \"%IB{at}\" }}, ") } else { String::new() };
+        let input =
+            if both { format!("{{ object = \"6000:01\", to = \"%IB{at}\" }}, ") } else { String::new() };
         let output = format!("{{ object = \"6200:01\", from = \"%QB{at}\" }}");
         let keys = format!("id = {id}\neds = \"{EDS_FILE}\"\nmandatory = true\nheartbeat = \"1s\"");
         format!("\n[[service.node]]\n{keys}\nmap = [{input}{output}]\n")
@@ -50,7 +53,8 @@ fn text(last: u8, both: bool) -> String {
     STACK.replace("NODES", &(2..=last).map(node).collect::<String>())
 }
 
-/// From the SYNC on the bus to the last PDO that the master sends for it.
+/// From the SYNC to the last PDO that the master sends for it, in the driver's queue: the master's own clock. On the
+/// virtual bus all of them have one stamp, since the driver takes them together.
 pub fn process_data(bench: &mut Bench) -> anyhow::Result<()> {
     let span = Duration::from_secs(bench.seconds(SECONDS));
     let last = PDOS + 1;
@@ -59,32 +63,37 @@ pub fn process_data(bench: &mut Bench) -> anyhow::Result<()> {
         let mut ctx = stack.join()?;
         let root = ctx.stack.root.clone();
         let mut rx = ctx.subscriber::<CanFrame>("can0/rx")?;
-        let (mut samples, mut syncs) = (Samples::default(), 0u64);
+        let (mut handed, mut on_bus) = (Samples::default(), Samples::default());
+        let mut syncs = 0u64;
         with_fleet(&root, "can0", 2..=last, || {
             let mut master = Master::open(&mut ctx, "io")?;
             master.wait_operational(&mut stack, usize::from(PDOS))?;
             observe(&mut stack, &mut rx, Duration::from_millis(200), |_, _| ())?;
-            let (mut began_ns, mut count) = (None, 0);
-            observe(&mut stack, &mut rx, span, |t_ns, frame| match frame.id() {
-                SYNC => {
-                    (began_ns, count) = (Some(t_ns), 0);
-                    syncs += 1;
-                }
-                // The first RPDO of each node.
-                0x202..=0x27F => {
-                    count += 1;
-                    if let Some(began_ns) = began_ns.filter(|_| count == PDOS) {
-                        samples.push(t_ns.saturating_sub(began_ns) as f64 / 1e3);
+            let (mut sync_ns, mut count) = (None, 0);
+            let began = Instant::now();
+            while began.elapsed() < span {
+                observe(&mut stack, &mut rx, LOOK, |t_ns, frame| match frame.id() {
+                    SYNC => (sync_ns, count, syncs) = (Some(t_ns), 0, syncs + 1),
+                    // The first RPDO of each node.
+                    0x202..=0x27F => {
+                        count += 1;
+                        if let Some(sync_ns) = sync_ns.filter(|_| count == PDOS) {
+                            on_bus.push(t_ns.saturating_sub(sync_ns) as f64 / 1e3);
+                        }
                     }
-                }
-                _ => {}
-            })
+                    _ => {}
+                })?;
+                handed.push(count_of(&master.status()?, "/sync_out_us/last")?);
+            }
+            Ok(())
         })?;
-        ensure!(samples.len() > 0, "{PDOS} PDOs were never seen behind one SYNC");
-        bench.info(format!("SYNCs with all {PDOS} PDOs"), samples.len() as f64 / syncs as f64 * 100.0, "%");
-        let samples = samples.sorted();
-        bench.goal(format!("SYNC -> last of {PDOS} PDOs on the bus, p50"), samples.p50(), "us", Goal::Below(200.0));
-        bench.info(format!("SYNC -> last of {PDOS} PDOs on the bus, p99"), samples.p99(), "us");
+        ensure!(on_bus.len() > 0, "{PDOS} PDOs were never seen behind one SYNC");
+        bench.info(format!("SYNCs with all {PDOS} PDOs"), on_bus.len() as f64 / syncs as f64 * 100.0, "%");
+        let (handed, on_bus) = (handed.sorted(), on_bus.sorted());
+        let what = format!("SYNC -> last of {PDOS} PDOs");
+        bench.goal(format!("{what} handed out, p50"), handed.p50(), "us", Goal::Below(200.0));
+        bench.goal(format!("{what} handed out, p99"), handed.p99(), "us", Goal::Below(200.0));
+        bench.info(format!("{what}, by their stamps on the bus, p99"), on_bus.p99(), "us");
     }
     stack.down()?;
     Ok(())
@@ -104,7 +113,11 @@ pub fn full(bench: &mut Bench) -> anyhow::Result<()> {
             let began = Instant::now();
             master.ask(&[json!({ "do": "nmt", "command": "reset_communication", "node": 0 })], || ())?;
             master.wait_operational(&mut stack, nodes)?;
-            bench.info(format!("{} nodes reset and booted, heartbeat 1 s", nodes + 1), began.elapsed().as_secs_f64(), "s");
+            bench.info(
+                format!("{} nodes reset and booted, heartbeat 1 s", nodes + 1),
+                began.elapsed().as_secs_f64(),
+                "s",
+            );
             let before = master.status()?;
             let meter = CpuMeter::start(stack.processes()?);
             let began = Instant::now();
@@ -114,16 +127,27 @@ pub fn full(bench: &mut Bench) -> anyhow::Result<()> {
             }
             let cpu = meter.stop();
             let after = master.status()?;
-            let of = |name: &str| cpu.iter().find(|(n, _)| n == name).map_or(f64::NAN, |(_, percent)| *percent);
-            bench.goal(format!("CPU of the master of {} nodes, SYNC 10 ms", nodes + 1), of("io"), "%", Goal::Below(30.0));
+            let of =
+                |name: &str| cpu.iter().find(|(n, _)| n == name).map_or(f64::NAN, |(_, percent)| *percent);
+            bench.goal(
+                format!("CPU of the master of {} nodes, SYNC 10 ms", nodes + 1),
+                of("io"),
+                "%",
+                Goal::Below(30.0),
+            );
             bench.info("CPU of the bus driver", of("can0"), "%");
-            let grown = |at: &str| Some(count(&after, at)? - count(&before, at)?);
-            let syncs = grown("/network/syncs").context("no counter of SYNCs")?;
-            for (name, at) in [("PDOs from the nodes", "/pdo/rx_pdos"), ("PDOs to the nodes", "/pdo/tx_pdos")] {
-                let got = grown(at).with_context(|| format!("no counter {at}"))?;
-                bench.info(format!("{name}, of one a node and SYNC"), got / (syncs * nodes as f64) * 100.0, "%");
+            let grown = |at: &str| anyhow::Ok(count_of(&after, at)? - count_of(&before, at)?);
+            let syncs = grown("/network/syncs")?;
+            for (name, at) in [("PDOs from the nodes", "/pdo/rx_pdos"), ("PDOs to the nodes", "/pdo/tx_pdos")]
+            {
+                let got = grown(at)?;
+                bench.info(
+                    format!("{name}, of one a node and SYNC"),
+                    got / (syncs * nodes as f64) * 100.0,
+                    "%",
+                );
             }
-            let whole = grown("/pdo/complete_samples").context("no counter of samples")?;
+            let whole = grown("/pdo/complete_samples")?;
             bench.info("samples with all PDOs in", whole / syncs * 100.0, "%");
             Ok(())
         })?;
@@ -132,6 +156,6 @@ pub fn full(bench: &mut Bench) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn count(status: &Value, at: &str) -> Option<f64> {
-    status.pointer(at)?.as_f64()
+fn count_of(status: &Value, at: &str) -> anyhow::Result<f64> {
+    status.pointer(at).and_then(Value::as_f64).with_context(|| format!("the master's status has no {at}"))
 }

@@ -131,7 +131,8 @@ impl Side {
         let mut look = || {
             rx.drain(8192, |frame, _| {
                 if matches!(frame.id(), SDO_RX | SDO_TX) {
-                    (first, last, frames) = (first.min(frame.stamp.t_ns), last.max(frame.stamp.t_ns), frames + 1);
+                    (first, last, frames) =
+                        (first.min(frame.stamp.t_ns), last.max(frame.stamp.t_ns), frames + 1);
                 }
             });
         };

@@ -130,7 +130,8 @@ mod tests {
     #[test]
     fn lateness_counts_from_the_earliest_also_over_the_end_of_a_period() {
         let late = |offsets: &[u64]| {
-            let stamps: Vec<u64> = offsets.iter().enumerate().map(|(i, o)| i as u64 * PERIOD_NS + o).collect();
+            let stamps: Vec<u64> =
+                offsets.iter().enumerate().map(|(i, o)| i as u64 * PERIOD_NS + o).collect();
             lateness(&stamps).unwrap()
         };
         let some = late(&[50_000, 20_000, 120_000]);

@@ -33,6 +33,8 @@ pub struct Com {
     pub events: Events,
     /// What the present SDO frame wrote.
     pub written: Option<(u16, u8)>,
+    /// Another device with this node-id was heard.
+    pub collided: bool,
 }
 
 impl Com {

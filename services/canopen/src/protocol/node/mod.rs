@@ -97,6 +97,7 @@ impl Node {
             store,
             events: event::Events::default(),
             written: None,
+            collided: false,
         };
         let servers = SdoServers::new(&od, params.sdo);
         Ok(Self { od, servers, com })
@@ -110,6 +111,7 @@ impl Node {
     fn reset(&mut self, t_ns: u64, application: bool, out: &mut Outbox) {
         let com = &mut self.com;
         com.nmt.initialise();
+        com.collided = false;
         if let Some(lss) = &mut com.lss {
             com.node_id = lss.pending_node_id();
             lss.node_id_taken();
@@ -263,6 +265,10 @@ impl Node {
                 failed = event.is_some_and(|event| com.life_event(event));
             }
         } else if frame.can_id == predefined::ERROR_CONTROL + u32::from(node_id) {
+            // Once until the next reset: the other device's every heartbeat tells the same.
+            if std::mem::replace(&mut com.collided, true) {
+                return;
+            }
             com.events.push(NodeEvent::DuplicateNodeId { node_id });
             let message = com.emcy.report(
                 emcy::code::ID_COLLISION,

@@ -347,7 +347,10 @@ fn time_duplicates_and_consumed_emcys_are_events() {
     bench.frame(0x100, &[1, 0, 0, 0, 2, 0]);
     bench.frame(0x085, &[0x30, 0x81, 0x11, 0, 0, 0, 0, 0]);
     bench.frame(0x704, &[0x7F]);
+    bench.frame(0x704, &[0x7F]);
     let events = bench.events();
+    let twins = events.iter().filter(|e| matches!(e, NodeEvent::DuplicateNodeId { .. }));
+    assert_eq!(twins.count(), 1, "told once, not with every heartbeat of the other");
     assert_eq!(events[0], NodeEvent::Time(crate::protocol::time_stamp::TimeOfDay { ms: 1, days: 2 }));
     assert!(matches!(events[1], NodeEvent::EmcyReceived { node_id: 5, emcy: Emcy { code: 0x8130, .. } }));
     assert_eq!(events[2], NodeEvent::DuplicateNodeId { node_id: 4 });
