@@ -513,7 +513,6 @@ impl Network {
         let before = node.state.replace(state);
         node.boot.on_alive(t_ns, state);
         self.count_beat(t_ns, i);
-        let node = &mut self.nodes[i];
         if before.is_some_and(|before| before != state) {
             self.count_change(t_ns, i);
         }

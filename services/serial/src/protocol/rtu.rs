@@ -25,7 +25,7 @@ pub fn cut(bytes: &[u8], marks: &[u16], mut piece: impl FnMut(Piece)) {
     let mut from = 0;
     let mut junk = 0;
     while from < bytes.len() {
-        if let Some(to) = frame_at(bytes, marks, from) {
+        if let Some(to) = frame_at(bytes, marks, from).filter(|to| !is_stolen(bytes, marks, from, *to)) {
             if junk < from {
                 piece(Piece { from: junk, to: from, good: false });
             }
@@ -39,6 +39,13 @@ pub fn cut(bytes: &[u8], marks: &[u16], mut piece: impl FnMut(Piece)) {
     if junk < bytes.len() {
         piece(Piece { from: junk, to: bytes.len(), good: false });
     }
+}
+
+/// Whether a frame that reaches over a silence takes bytes of a good frame that begins behind that silence: the one
+/// before broke off, and its missing CRC bytes happen to be the first ones of the next.
+fn is_stolen(bytes: &[u8], marks: &[u16], from: usize, to: usize) -> bool {
+    let mut inside = marks.iter().map(|m| usize::from(*m)).filter(|m| *m > from && *m < to);
+    inside.any(|mark| frame_at(bytes, marks, mark).is_some())
 }
 
 /// Where the good frame that begins at `from` ends: at the end of all, at the length its function has, or at a silence.
@@ -86,6 +93,14 @@ mod tests {
         let torn = [&request[..5], &answer[..]].concat();
         assert_eq!(pieces(&torn, &[5]), [(0, 5, false), (5, 14, true)]);
         assert_eq!(pieces(&torn, &[]), [(0, 14, false)]);
+        // One that broke off before a byte that the next one happens to begin with.
+        let other = frame(&[0x30, 6, 0, 0x50, 0xC3, 0x1B]);
+        let next = frame(&[1, 0x16, 0, 0x61, 0xB5, 0xA7, 0x1D, 0xB9]);
+        let stolen = [&other[..7], &next[..]].concat();
+        assert_eq!((other[7], next[0]), (1, 1));
+        assert_eq!(pieces(&stolen, &[7]), [(0, 7, false), (7, 17, true)]);
+        // The other way round: in parts, and what stands behind a silence is no frame of its own.
+        assert_eq!(pieces(&stolen[..8], &[3, 7]), [(0, 8, true)]);
         // An unknown function between silences.
         let own = frame(&[9, 100, 1, 2, 3]);
         let all = [&own[..], &request[..], &[0xFF]].concat();
