@@ -159,7 +159,8 @@ fn no_scan_sees_two_syncs_under_load_and_while_nodes_drop_out() {
     let mut stack = Stack::spawn("coherence", &text(can_port), &[("main.st", PROGRAM), ("io401.eds", IO401)]);
     stack.wait("a running stack", || {
         let rows = stack.ps();
-        (!rows.is_empty() && rows.iter().all(|r| r["state"] == "running" && r["health"] != "starting")).then_some(())
+        (!rows.is_empty() && rows.iter().all(|r| r["state"] == "running" && r["health"] != "starting"))
+            .then_some(())
     });
     let devices = Devices::start(stack.root().to_owned());
     wait_whole(&stack);
@@ -184,9 +185,11 @@ fn no_scan_sees_two_syncs_under_load_and_while_nodes_drop_out() {
     sleep(Duration::from_secs(3));
     wait_whole(&stack);
     assert!(load.end() > 0);
-    let lost: Vec<u64> = [20, 21, 22, 2, 3, 4].map(|id| node(&stack, id).unwrap()["losses"].as_u64().unwrap_or(0)).into();
+    let lost: Vec<u64> =
+        [20, 21, 22, 2, 3, 4].map(|id| node(&stack, id).unwrap()["losses"].as_u64().unwrap_or(0)).into();
     assert!(lost.iter().all(|&n| n >= 1), "{lost:?}");
-    let mixed = [count(&stack, "Mixed"), count(&stack, "Samples"), count(&stack, "Whole"), count(&stack, "Partly")];
+    let mixed =
+        [count(&stack, "Mixed"), count(&stack, "Samples"), count(&stack, "Whole"), count(&stack, "Partly")];
     let at = ["MixedAt", "MixedFirst", "MixedOther"].map(|v| stack.read(v).to_string());
     let pdo = status(&stack).unwrap()["pdo"].clone();
     eprintln!("mixed, samples, whole, partly: {mixed:?}; pdo {pdo}");

@@ -230,7 +230,7 @@ impl Peer {
             1 => (read_request(3, at, count), vec![0x83, 2]),
             2 => {
                 let inner = self.mode.frame(1, &[&[6][..], &words(&[self.base, at])].concat());
-                let inner = if inner.len() % 2 == 0 { inner } else { [inner, vec![0]].concat() };
+                let inner = if inner.len().is_multiple_of(2) { inner } else { [inner, vec![0]].concat() };
                 let count = (inner.len() / 2) as u16;
                 (read_request(3, at, count), [&[3, inner.len() as u8][..], &inner].concat())
             }

@@ -440,7 +440,11 @@ impl<B: Backend + 'static> Hub<B> {
             let waiting = session.is_waiting();
             let begin = Instant::now();
             // One client alone that asks again within microseconds: sleeping would cost it more than the wait does.
-            let early = if eager && self.clients.borrow().len() == 1 { early(&stream, session.space()) } else { None };
+            let early = if eager && self.clients.borrow().len() == 1 {
+                early(&stream, session.space())
+            } else {
+                None
+            };
             let read = match early {
                 Some(read) => Some(read),
                 None => tokio::select! {

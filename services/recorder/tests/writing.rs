@@ -317,7 +317,11 @@ fn a_program_loaded_while_recording_stands_in_this_file_and_the_next() {
     };
     let names = |file: &std::path::Path| {
         let found = dinrail_recorder::scan::attachments(file).unwrap();
-        found.into_iter().filter(|a| a.name.ends_with(".wasm")).map(|a| (a.name, a.data)).collect::<Vec<_>>()
+        found
+            .into_iter()
+            .filter(|a| std::path::Path::new(&a.name).extension().is_some_and(|e| e == "wasm"))
+            .map(|a| (a.name, a.data))
+            .collect::<Vec<_>>()
     };
     let mut rig = Rig::start(stack.clone(), Config::default());
     rig.send(&[frame(1, clock::mono_ns())]);

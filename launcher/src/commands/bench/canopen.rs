@@ -140,7 +140,9 @@ fn with_fleet<T>(
             player.play(&mut fleet, |fleet, now_ns, out| {
                 if !std::mem::replace(&mut on, true) {
                     let ids: Vec<u8> = fleet.ids().collect();
-                    ids.into_iter().for_each(|id| fleet.power_on(now_ns, id, out));
+                    for id in ids {
+                        fleet.power_on(now_ns, id, out);
+                    }
                 }
                 !stop.load(Ordering::Relaxed)
             })?;

@@ -50,7 +50,7 @@ fn network(stack: &Stack, service: &ServiceEntry) -> anyhow::Result<Network> {
     let rate = bus.and_then(|bus| stack.service(bus)).and_then(|bus| bus.config.get("bitrate"));
     let bitrate = rate.and_then(|rate| match rate {
         Value::Number(n) => n.as_u64().and_then(|n| u32::try_from(n).ok()),
-        Value::String(text) => text.parse::<ipc_types::units::BitRate>().ok().map(|r| r.0 as u32),
+        Value::String(text) => text.parse::<ipc_types::units::BitRate>().ok().map(|r| r.0),
         _ => None,
     });
     Ok(Network { name: service.name.clone(), config, devices, plan, bitrate })

@@ -43,7 +43,7 @@ impl std::fmt::Display for Failed {
 enum Wire {
     Tcp { stream: TcpStream, transaction: u16 },
     RtuOverTcp(TcpStream),
-    Serial { port: Port, ascii: bool, char_ns: u64, t35: Duration },
+    Serial { port: Box<Port>, ascii: bool, char_ns: u64, t35: Duration },
     Service { name: String, line: Box<JobLine> },
 }
 
@@ -254,7 +254,12 @@ fn serial(text: &str, ascii: bool) -> anyhow::Result<Wire> {
         eprintln!("dinrail: {note}");
     }
     let timing = config.timing();
-    Ok(Wire::Serial { port, ascii, char_ns: timing.char_ns, t35: Duration::from_nanos(timing.t35_ns) })
+    Ok(Wire::Serial {
+        port: Box::new(port),
+        ascii,
+        char_ns: timing.char_ns,
+        t35: Duration::from_nanos(timing.t35_ns),
+    })
 }
 
 fn service(name: &str, stack: Option<&str>) -> anyhow::Result<Wire> {

@@ -28,7 +28,7 @@ use std::time::{Duration, Instant};
 /// Keys and signals are looked for at least this often.
 const LOOK: Duration = Duration::from_millis(100);
 /// Shortest and longest time between two refreshes.
-const EVERY: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(60));
+const EVERY: (Duration, Duration) = (Duration::from_millis(100), Duration::from_mins(1));
 /// The launcher answers a restart within 15 s.
 const RESTART_LIMIT: Duration = Duration::from_secs(20);
 
@@ -108,7 +108,7 @@ impl Screen {
         match feed.look() {
             // Another launcher in the place of the one that was joined: everything on the rail is new.
             Ok(snapshot) if snapshot.stack.as_ref().is_some_and(|s| s.pid != self.stack.pid) => {
-                self.feed = None
+                self.feed = None;
             }
             Ok(snapshot) => {
                 self.model.take(snapshot);

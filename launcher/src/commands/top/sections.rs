@@ -164,7 +164,7 @@ pub fn plcs(model: &Model) -> Section {
 pub fn recorders(model: &Model) -> Section {
     let rows = told(model, |kind| kind == "recorder").map(|(name, s)| {
         let paused = text(s, "paused").map(printable);
-        let file = text(s, "file").map(|f| f.rsplit('/').next().unwrap_or(f)).unwrap_or(NONE);
+        let file = text(s, "file").map_or(NONE, |f| f.rsplit('/').next().unwrap_or(f));
         let per_h = number(s, "mb_per_h").map_or_else(|| NONE.to_owned(), |n| format!("{n:.1}"));
         let mib = number(s, "bytes").map_or_else(|| NONE.to_owned(), |n| format!("{:.1}", n / 1_048_576.0));
         vec![

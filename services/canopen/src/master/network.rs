@@ -449,7 +449,7 @@ impl Network {
         match id & 0x780 {
             predefined::SDO_TX => self.transfers.on_frame(t_ns, node, frame, out),
             predefined::ERROR_CONTROL if !frame.is_remote() && node != 0 => {
-                self.on_error_control(t_ns, node, frame.payload())
+                self.on_error_control(t_ns, node, frame.payload());
             }
             predefined::EMCY if node != 0 => self.on_emcy(node, frame.payload()),
             _ => {

@@ -121,7 +121,7 @@ fn a_network_boots_and_exchanges() {
     assert!(bus.slaves.iter().all(|s| s.state == NmtState::Operational));
     assert_eq!(bus.slaves[0].od.u16(0x1017, 0), Some(50));
     // The node watches the master at three times its heartbeat, but no shorter than a restart takes.
-    assert_eq!(bus.slaves[0].od.u32(0x1016, 1), Some(1 << 16 | 500));
+    assert_eq!(bus.slaves[0].od.u32(0x1016, 1), Some(0x0001_0000 + 500));
     bus.samples.clear();
     bus.send(2, CanFrame::classic(0x182, &[0x5A, 0]));
     assert_eq!(bus.samples.pop(), Some((false, vec![0x5A, 0, 0, 2])));

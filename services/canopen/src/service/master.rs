@@ -34,6 +34,8 @@ use std::collections::{BTreeMap, VecDeque};
 const MAX_WAITING: usize = 1024;
 /// A full queue of the driver is tried again after this time.
 const RETRY_NS: u64 = 1_000_000;
+/// So long the first frames wait for a driver that still starts.
+const DRIVER_NS: u64 = 1_000_000_000;
 /// Jobs under way; more are refused.
 const MAX_JOBS: usize = 64;
 /// Values of up to so many bytes are not worth a block transfer (protocol switch threshold).
@@ -202,6 +204,7 @@ pub fn run(mut ctx: Context) -> Result<(), RunError> {
         results,
         out: Outbox::default(),
         waiting: VecDeque::with_capacity(MAX_WAITING),
+        driver_until_ns: clock::mono_ns() + DRIVER_NS,
         dropped: 0,
         published_ns: 0,
         image_ns: 0,
@@ -250,6 +253,8 @@ struct Service {
     results: Publisher<JobResult>,
     out: Outbox,
     waiting: VecDeque<CanFrame>,
+    /// Until then frames wait for a driver that was never there yet.
+    driver_until_ns: u64,
     /// Frames that found no room for longer than [`MAX_WAITING`] others.
     dropped: u64,
     published_ns: u64,
@@ -376,8 +381,11 @@ impl Service {
             match tx.send(*frame) {
                 Ok(_) => {
                     any = true;
+                    self.driver_until_ns = 0;
                     self.waiting.pop_front();
                 }
+                // It starts at the same time as the master, and the reset of all nodes must not be lost.
+                Err(SendError::NoReader(_)) if clock::mono_ns() < self.driver_until_ns => break,
                 // The driver is away or busy: old frames are of no use to anybody.
                 Err(SendError::NoReader(_)) => {
                     self.dropped += self.waiting.len() as u64;
@@ -816,7 +824,8 @@ impl Service {
         (self.event_budget, self.events_left_out) = (EVENTS_A_SECOND, 0);
         let mut status = self.network_status();
         if status.to_string().len() > STATUS_BYTES {
-            for node in status["nodes"].as_array_mut().into_iter().flatten().filter_map(Value::as_object_mut) {
+            for node in status["nodes"].as_array_mut().into_iter().flatten().filter_map(Value::as_object_mut)
+            {
                 node.remove("failure");
                 node.remove("name");
             }

@@ -156,7 +156,7 @@ pub fn run(mut ctx: Context) -> Result<(), RunError> {
         (lss.store, lss.bit_timing) = (config.store.is_some(), 0);
     }
     let serial = device.od.u32(0x1018, 4);
-    let node = match Node::new(device.od.clone(), params.clone(), &keep.objects()) {
+    let node = match Node::new(device.od.clone(), params, &keep.objects()) {
         Ok(node) => node,
         Err(e) => {
             // A file that was damaged must not keep the device from working.

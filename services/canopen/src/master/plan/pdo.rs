@@ -201,7 +201,7 @@ impl<'a> PdoPlanner<'a> {
                 match self.device.resolve(object).and_then(|o| self.mappable(direction, o)) {
                     Ok(mapped) => mapping.push(mapped),
                     Err(message) => {
-                        mistakes.add(&format!("{key}.mapping[{i}]"), message, "map another object")
+                        mistakes.add(&format!("{key}.mapping[{i}]"), message, "map another object");
                     }
                 }
             }
@@ -213,7 +213,7 @@ impl<'a> PdoPlanner<'a> {
         match cob_id {
             None => {}
             Some((_, Some(id))) if (0..=0x7FF).contains(&id) && !is_restricted(id as u32) => {
-                pdo.cob_id = id as u32
+                pdo.cob_id = id as u32;
             }
             Some((written, _)) => {
                 let message = format!("{written} is no COB-ID that a PDO may have");
