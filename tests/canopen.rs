@@ -10,8 +10,8 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
-use support::peers::peer;
-use support::{Scratch, Stack, free_port, wait_for};
+use support::peers::{peer, program};
+use support::{Scratch, Stack, free_port, skip, wait_for};
 
 /// Transfers of a megabyte by interpreted programs, on a machine that is shared.
 const LONG: Duration = Duration::from_mins(2);
@@ -500,4 +500,89 @@ fn our_master_drives_devices_made_of_durand() {
         &stack,
         "node 12 (Durand) reports emergency 2310h, current; error register 03h, vendor bytes 616D707321",
     );
+}
+
+/// node.js with node-canopen, installed once beside the build.
+fn node_canopen() -> Option<Command> {
+    let mut command = program("node", "nodejs")?;
+    program("npm", "npm")?;
+    let exe = std::env::current_exe().unwrap();
+    let target = exe.ancestors().nth(3).unwrap();
+    let (dir, lock) = (target.join("peers-node"), include_str!("peers/node/package-lock.json"));
+    let turn = fs::File::create(target.join("peers-node.lock")).unwrap();
+    turn.lock().unwrap();
+    if fs::read_to_string(dir.join("installed.json")).is_ok_and(|done| done == lock) {
+        return Some(with_modules(command, &dir));
+    }
+    let _ = fs::remove_dir_all(&dir);
+    fs::create_dir_all(&dir).unwrap();
+    fs::write(dir.join("package.json"), include_str!("peers/node/package.json")).unwrap();
+    fs::write(dir.join("package-lock.json"), lock).unwrap();
+    // Newer npm leaves install scripts out, and node-crc is compiled by one.
+    for args in [&["ci", "--no-audit", "--no-fund"][..], &["rebuild", "--foreground-scripts", "node-crc"]] {
+        let output = Command::new("npm").args(args).current_dir(&dir).output().unwrap();
+        if !output.status.success() {
+            skip(&format!("npm {args:?}: {}", String::from_utf8_lossy(&output.stderr)));
+            return None;
+        }
+    }
+    fs::write(dir.join("installed.json"), lock).unwrap();
+    command = with_modules(command, &dir);
+    Some(command)
+}
+
+fn with_modules(mut command: Command, dir: &Path) -> Command {
+    command.env("NODE_PATH", dir.join("node_modules"));
+    command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/peers/node/canopen_slave.js"));
+    command
+}
+
+const NODE_NODE: &str = r#"
+[[service.node]]
+id = 13
+eds = "io401.eds"
+heartbeat = "200ms"
+check = ["device_type", "vendor", "product", "revision", "serial"]
+serial_number = 13
+status_to = "%IB33"
+sdo = [{ object = "2001", value = "0xBEEF" }]
+tpdo = [{ number = 2, transmission = 254 }]
+map = [
+    { object = "6000:01", to = "%IB3" },
+    { object = "6200:01", from = "%QB3" },
+    { object = "6401:02", to = "%IW5" },
+    { object = "6411:02", from = "%QW5" },
+]
+"#;
+
+#[test]
+fn our_master_drives_a_device_made_of_node_canopen() {
+    let Some(mut command) = node_canopen() else { return };
+    let ports = Ports::new();
+    let stack = Stack::spawn("conode", &our_master(&ports, NODE_NODE), &[("io401.eds", EDS)]);
+    stack.wait("the bus at work", || stack.is_ready("can0").then_some(()));
+    command.arg(&ports.cannelloni).arg(stack.scratch.0.join("io401.eds")).args(["13", "13"]);
+    let mut device = Peer::start(command);
+    device.says("operational 0xbeef");
+    becomes(&stack, "%IB33", 5);
+    exchanges(&stack, &[("%QB3", "%IB3"), ("%QW5", "%IW5")]);
+    let name = stack.ok(&["canopen", "sdo", "read", "13", "1008"]);
+    assert_eq!(name.trim(), "1008:00 Manufacturer device name = Simulated I/O");
+    assert!(refused(&stack, &["canopen", "sdo", "read", "13", "5000"]).contains("06020000h"));
+    there_and_back(&stack, "13", 10_240, "segmented");
+    // Only to it by block: its own block upload ends the whole program now and then.
+    let value = long_value(10_241);
+    let file = stack.scratch.write("value.bin", &value);
+    let back = stack.scratch.0.join("back.bin");
+    stack.ok(&["canopen", "sdo", "write", "13", "2000", "--input", path(&file), "--mode", "block"]);
+    stack.ok(&["canopen", "sdo", "read", "13", "2000", "--output", path(&back), "--mode", "segmented"]);
+    assert!(fs::read(&back).unwrap() == value);
+    device.tell("emcy");
+    log_has(&stack, "node 13 (Simulated I/O) reports emergency 3100h, voltage");
+    stack.ok(&["canopen", "nmt", "reset-node", "13"]);
+    device.says("booted");
+    device.says("operational 0xbeef");
+    drop(device);
+    log_has(&stack, "node 13 (Simulated I/O) is lost: it sends no heartbeat any more");
+    becomes(&stack, "%IB33", 0);
 }

@@ -236,6 +236,9 @@ fn a_node_is_pulled_its_inputs_are_stale_and_good_again_when_it_is_back() {
     assert_eq!(stack.read("Buttons"), 90, "a bad input is held");
     wait_said(&stack, "io", "node 2 (Simulated I/O) is lost: it sends no heartbeat any more");
     assert_eq!(node(&stack, 2).unwrap()["state"], "unknown");
+    let shown = stack.ok(&["canopen", "status"]);
+    assert!(shown.starts_with("io, node 1, operational: a mandatory node is missing\n"), "{shown}");
+    stack.wait("a degraded master", || (stack.service("io")?["health"] == "degraded").then_some(()));
     // The other one goes on.
     assert_eq!(node(&stack, 3).unwrap()["operational"], true);
     stack.ok(&["plc", "write", "Pattern=17"]);

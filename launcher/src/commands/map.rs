@@ -289,7 +289,7 @@ fn text(points: &[Point], servers: &[ServerMap]) -> String {
         out += &table(&HEAD, &rows);
     }
     if points.is_empty() {
-        out += "no point matches\n";
+        out += "no points\n";
     }
     for server in servers {
         let unit = server.unit.map(|unit| format!("unit {unit} of ")).unwrap_or_default();
@@ -348,7 +348,7 @@ mod tests {
         let found = registers(&maps[0], (Area::Marker, 7, Some(2)));
         assert_eq!((found[0].number.as_str(), found[0].bit), ("40004", Some(10)));
         assert!(text(&points, &servers).contains("registers of 'modbus' over the image of 'plc'"));
-        assert_eq!(text(&[], &[]), "no point matches\n");
+        assert_eq!(text(&[], &[]), "no points\n");
     }
 
     #[test]

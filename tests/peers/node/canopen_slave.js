@@ -90,21 +90,20 @@ eds.addSdoServerParameter(0, 0x580 + nodeId, 0x600 + nodeId);
 const bus = new Bus((message) => device.receive(message));
 device.addListener('message', (message) => bus.send(message));
 
-function wire() {
-    eds.getEntry(0x1018)[4].value = Number(serial);
+/** The inputs show the outputs. */
+function show() {
     for (const [from, to, count] of [[0x6200, 0x6000, 2], [0x6411, 0x6401, 4]]) {
-        for (let sub = 1; sub <= count; ++sub) {
-            const output = eds.getEntry(from)[sub];
-            output.removeAllListeners('update');
-            output.on('update', () => { eds.getEntry(to)[sub].value = output.value; });
-        }
+        for (let sub = 1; sub <= count; ++sub)
+            eds.getEntry(to)[sub].value = eds.getEntry(from)[sub].value;
     }
 }
+
+device.pdo.on('pdo', show);
 
 let last = INITIALIZING;
 device.nmt.on('changeState', (state) => {
     if (state === PRE_OPERATIONAL && last === INITIALIZING) {
-        wire();
+        eds.getEntry(0x1018)[4].value = Number(serial);
         bus.send({ id: 0x700 + nodeId, data: Buffer.from([0]) });
         say('booted');
     }

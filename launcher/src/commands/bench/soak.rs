@@ -30,13 +30,17 @@ const REGISTERS: u16 = 10;
 const PARTS: [u64; 3] = [10, 45, 45];
 /// Growth that is none: allocators keep pages back by chance.
 const FLAT_MIB: f64 = 1.0;
+/// The launcher may still hold the connection that asked for the processes; a leak of twenty thousand connections or of
+/// a file a rotation is more.
+const GAINED: f64 = 1.0;
 /// How far TCP may be ahead of the line, in requests.
 const AHEAD: u64 = 1000;
 /// How long closed connections may take to be gone.
 const CLOSING: Duration = Duration::from_secs(5);
 const MIB: f64 = (1 << 20) as f64;
 
-/// A silence of 0.1 ms: on a pseudo-terminal without a pace frames come whole.
+/// A silence of 0.1 ms: on a pseudo-terminal without a pace frames come whole. Recordings are so small that the first
+/// of them end while the stack warms up.
 const STACK: &str = r#"
 [stack]
 name = "NAME"
@@ -81,8 +85,8 @@ period = "20ms"
 name = "rec"
 kind = "recorder"
 dir = "recordings"
-max_size = "16MiB"
-keep = "64MiB"
+max_size = "1MiB"
+keep = "8MiB"
 "#;
 
 /// What one process holds.
@@ -298,8 +302,11 @@ pub fn run(bench: &mut Bench) -> anyhow::Result<()> {
         let ended = Instant::now();
         stack.wait("the server to see its connections closed", |stack| {
             let (first, now) = (looks.first()?, Look::at(stack, name, requests).ok()?);
-            let more = |(p, q): (&(_, _, Held), &(_, _, Held))| q.2.descriptors > p.2.descriptors;
-            let more = first.processes.iter().zip(&now.processes).any(more);
+            let open = |look: &Look| {
+                let server = look.processes.iter().find(|(name, _, _)| name == "server");
+                server.map(|(_, _, held)| held.descriptors)
+            };
+            let more = open(&now) > open(first);
             // A leak never goes: then what is there is told.
             (!more || ended.elapsed() > CLOSING).then_some(())
         })?;
@@ -334,12 +341,12 @@ fn tell(
     let millions = (end.requests - warm.requests) as f64 / 1e6;
     for (i, (name, pid, last)) in end.processes.iter().enumerate() {
         let at = |look: &Look| look.processes.get(i).filter(|p| p.1 == *pid).map(|p| p.2);
-        let same = at(start).zip(at(warm));
-        let (first, before) = same.with_context(|| format!("{name} was restarted meanwhile"))?;
+        let same = at(start).and(at(warm));
+        let before = same.with_context(|| format!("{name} was restarted meanwhile"))?;
         let growth = (last.rss as f64 - before.rss as f64) / MIB;
         bench.goal(format!("{name}: memory grown since warm"), growth, "MiB", Goal::Below(FLAT_MIB));
-        let gained = last.descriptors as f64 - first.descriptors as f64;
-        bench.goal(format!("{name}: descriptors gained"), gained, "", Goal::AtMost(0.0));
+        let gained = last.descriptors as f64 - before.descriptors as f64;
+        bench.goal(format!("{name}: descriptors gained since warm"), gained, "", Goal::AtMost(GAINED));
         let list = |what: &dyn Fn(&Held) -> String| {
             let all: Vec<String> = looks.iter().filter_map(at).map(|held| what(&held)).collect();
             all.join(", ")
@@ -406,7 +413,10 @@ mod tests {
         tell(&mut bench, &Traffic::default(), 9, 1.0, &looks).unwrap();
         let missed: Vec<_> = bench.figures.iter().filter(|f| f.met == Some(false)).collect();
         let shown: Vec<_> = missed.iter().map(|f| (f.name.as_str(), f.value)).collect();
-        assert_eq!(shown, [("one: memory grown since warm", 2.0), ("one: descriptors gained", 2.0)]);
+        assert_eq!(
+            shown,
+            [("one: memory grown since warm", 2.0), ("one: descriptors gained since warm", 2.0)]
+        );
         assert!(bench.notes[0].contains("one: +1.00 MiB per million requests"), "{:?}", bench.notes);
         assert!(bench.notes[0].contains("descriptors 20, 20, 21, 22"), "{:?}", bench.notes);
         let mut looks = looks;

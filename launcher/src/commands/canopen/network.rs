@@ -40,8 +40,11 @@ fn status_text(service: &str, status: &Value) -> String {
         other => other.to_string(),
     };
     let bus = if status["bus_off"] == json!(true) { ", the bus is off" } else { "" };
-    let whole =
-        if status["started"] == json!(true) { "all mandatory nodes are booted" } else { "not complete" };
+    let whole = match (&status["started"], &status["whole"]) {
+        (Value::Bool(true), Value::Bool(false)) => "a mandatory node is missing",
+        (Value::Bool(true), _) => "all mandatory nodes are booted",
+        _ => "not complete",
+    };
     let mut text =
         format!("{service}, node {}, {}: {whole}{bus}\n\n", word(&status["node_id"]), word(&status["state"]));
     let nodes = status["nodes"].as_array().map_or(&[][..], Vec::as_slice);

@@ -305,6 +305,10 @@ impl Network {
     pub fn is_started(&self) -> bool {
         self.started
     }
+    /// Whether the network was started and no mandatory node has been lost since.
+    pub fn is_whole(&self) -> bool {
+        self.started && self.nodes.iter().all(|n| !n.settings.mandatory || n.boot.is_running())
+    }
     pub fn is_bus_off(&self) -> bool {
         self.bus_off
     }

@@ -12,6 +12,9 @@ pub const MAX_QUEUE: usize = 32;
 /// Ends that nobody took yet; the oldest is dropped, because who asked is gone.
 const MAX_ENDS: usize = 256;
 
+/// A job that boot-ups interrupt for longer than this fails: its node does not come back.
+const INTERRUPTED_NS: u64 = 20_000_000_000;
+
 /// Who asked for a transfer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Owner {
@@ -52,6 +55,8 @@ struct Slot {
     client: SdoClient,
     queue: VecDeque<Request>,
     current: Option<Request>,
+    /// Job that a boot-up interrupted, and when first.
+    interrupted: Option<(Owner, u64)>,
 }
 
 /// See the module.
@@ -92,7 +97,8 @@ impl Transfers {
         self.place[id] = self.slots.len() as u8;
         let config = ClientConfig { timeout_ns, ..ClientConfig::default() };
         let client = SdoClient::new(Channel::default_of(node), config);
-        self.slots.push(Slot { node, client, queue: VecDeque::with_capacity(MAX_QUEUE), current: None });
+        let queue = VecDeque::with_capacity(MAX_QUEUE);
+        self.slots.push(Slot { node, client, queue, current: None, interrupted: None });
     }
 
     fn slot(&mut self, node: u8) -> Option<&mut Slot> {
@@ -132,13 +138,32 @@ impl Transfers {
             // A job may take minutes, and the node stands still until it is booted: the job begins again afterwards.
             if let Some(job) = slot.current.take_if(|r| r.owner != Owner::Boot) {
                 slot.client.cancel(Abort::LOCAL_CONTROL, out);
-                slot.queue.insert(1, job);
+                let first = slot.interrupted.filter(|(owner, _)| *owner == job.owner);
+                let (_, since_ns) = *slot.interrupted.insert(first.unwrap_or((job.owner, now_ns)));
+                if now_ns.saturating_sub(since_ns) < INTERRUPTED_NS {
+                    slot.queue.insert(1, job);
+                } else {
+                    // A node that is away is tried for ever; who waits for the job is not kept waiting.
+                    self.gave_up(node, &job);
+                }
             }
         } else {
             slot.queue.push_back(request);
         }
         self.next(now_ns, node, out);
         true
+    }
+
+    /// Ends a job that boot-ups interrupted for too long.
+    fn gave_up(&mut self, node: u8, request: &Request) {
+        let Owner::Job(job) = request.owner else { return };
+        let direction = if request.data.is_some() { Direction::Write } else { Direction::Read };
+        let result = Err(Failure { abort: Abort::TIMEOUT, by: crate::protocol::sdo::By::Client });
+        if self.job_ends.len() == MAX_ENDS {
+            self.job_ends.pop_front();
+        }
+        let Request { index, sub, .. } = *request;
+        self.job_ends.push_back(JobEnd { job, node, index, sub, direction, bytes: 0, result });
     }
 
     /// Gives up what an owner asked of a node, without telling it.
@@ -279,6 +304,32 @@ mod tests {
             }
         }
         assert_eq!(order, [0, 1, 2]);
+    }
+
+    #[test]
+    fn a_job_for_a_node_that_stays_away_fails() {
+        let mut transfers = Transfers::new([(5, 2_000_000_000)]);
+        let mut out = Outbox::default();
+        let request =
+            |owner| Request { index: 0x2000, sub: 0, data: None, owner, options: Options::default() };
+        assert!(transfers.ask(0, 5, request(Owner::Job(7)), &mut out));
+        // The boot-up tries every second, before the job's time is over.
+        let mut ended = None;
+        for second in 1..60u64 {
+            let now_ns = second * 1_000_000_000;
+            transfers.cancel(5, Owner::Boot);
+            transfers.next(now_ns, 5, &mut out);
+            assert!(transfers.ask(now_ns, 5, request(Owner::Boot), &mut out));
+            out.drain().for_each(drop);
+            ended = transfers.take_job_end();
+            if ended.is_some() {
+                break;
+            }
+        }
+        let end = ended.unwrap();
+        assert_eq!(end.job, 7);
+        assert!(end.result.is_err_and(|failure| failure.is_timeout()));
+        assert!(transfers.take_job_end().is_none() && transfers.slots[0].queue.is_empty());
     }
 
     #[test]

@@ -760,7 +760,7 @@ impl Service {
                 words::event(&event, |n| self.node_text(n), |i, s| self.object_text(node, i, s));
             self.ctx.event(kind, level, text, detail);
         }
-        let whole = self.network.is_started() && !self.network.is_bus_off();
+        let whole = self.network.is_whole() && !self.network.is_bus_off();
         let state = if whole { HealthState::Ready } else { HealthState::Degraded };
         if state != self.state {
             self.state = state;
@@ -804,6 +804,7 @@ impl Service {
             "node_id": self.config.node_id,
             "state": state_name(self.network.state()),
             "started": self.network.is_started(),
+            "whole": self.network.is_whole(),
             "bus_off": self.network.is_bus_off(),
             "nodes": self.network.nodes().iter().map(|n| self.node_status(n)).collect::<Vec<_>>(),
             "network": self.network.counters(),
