@@ -546,7 +546,6 @@ check = ["device_type", "vendor", "product", "revision", "serial"]
 serial_number = 13
 status_to = "%IB33"
 sdo = [{ object = "2001", value = "0xBEEF" }]
-tpdo = [{ number = 2, transmission = 254 }]
 map = [
     { object = "6000:01", to = "%IB3" },
     { object = "6200:01", from = "%QB3" },

@@ -376,3 +376,11 @@ proptest! {
         })?;
     }
 }
+
+#[test]
+fn a_response_longer_than_a_pdu_is_refused() {
+    let mut pdu = vec![17, 255];
+    pdu.resize(257, 0);
+    let refused = crate::protocol::decode_response(&Request::ReportServerId, &pdu);
+    assert_eq!(refused, Err(crate::protocol::ResponseError::Length { function: 17 }));
+}
