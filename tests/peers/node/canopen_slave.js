@@ -1,7 +1,7 @@
 // A device made of node-canopen. Usage: node canopen_slave.js PORT EDS NODE-ID SERIAL
 //
 // An I/O device by its EDS whose inputs show its outputs. node-canopen sends no boot-up message and knows no $NODEID: both
-// are done here, as an application of it must. Commands on stdin: `emcy`, `emcy gone`. It prints what happens to it.
+// are done here, as an application of it must. It prints what happens to it.
 
 'use strict';
 
@@ -9,8 +9,7 @@ const fs = require('fs');
 const net = require('net');
 const os = require('os');
 const path = require('path');
-const readline = require('readline');
-const { Device, Eds, EmcyCode } = require('canopen');
+const { Device, Eds } = require('canopen');
 
 const GREETING = 'CANNELLONIv1';
 const RTR = 0x40000000;
@@ -116,10 +115,3 @@ bus.onReady = () => {
     device.start();
     say('ready');
 };
-
-readline.createInterface({ input: process.stdin }).on('line', (line) => {
-    if (line === 'emcy')
-        device.emcy.write({ code: EmcyCode.VOLTAGE_MAINS, info: Buffer.from('volts') });
-    else if (line === 'emcy gone')
-        device.emcy.write({ code: 0 });
-});
