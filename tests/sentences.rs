@@ -66,10 +66,10 @@ fn a_program_that_does_not_compile_names_its_line() {
 
 #[test]
 fn a_service_that_is_not_there_yet_says_so() {
-    let text = "[stack]\nname = \"s\"\n[[service]]\nname = \"io\"\nkind = \"canopen-master\"\n";
+    let text = "[stack]\nname = \"s\"\n[[service]]\nname = \"io\"\nkind = \"j1939\"\n";
     let (code, said) = check(text, &[]);
     assert_eq!(code, 1, "{said}");
-    says(&said, &["stack.toml:5", "canopen-master", "not supported"]);
+    says(&said, &["stack.toml:5", "j1939", "not supported"]);
 }
 
 #[test]

@@ -220,7 +220,8 @@ mod tests {
         assert!(stale.contains(&"can-io.stale_after".to_owned()), "{stale:?}");
         assert!(stale.contains(&"modbus-server.stale_after".to_owned()), "{stale:?}");
         assert_eq!(found("modbus-server.tcp.port"), ["modbus-server.tcp.port"]);
-        assert!(found("port").contains(&"modbus-server.tcp.port".to_owned()));
+        // Nothing has it as a whole name: every table's last part counts.
+        assert!(found("on_exhausted").contains(&"service.restart.on_exhausted".to_owned()));
         assert_eq!(found("can-io.in[3].to"), ["can-io.in[].to"]);
         assert_eq!(found("can-io.out.signals.from"), ["can-io.out[].signals[].from"]);
         assert!(found("can-io.in").contains(&"can-io.in[].to".to_owned()));
