@@ -343,8 +343,9 @@ impl Network {
     }
 
     fn boot_all(&mut self, now_ns: u64) {
-        self.started = false;
-        self.state = 127;
+        // A master without nodes has nothing to wait for.
+        self.started = self.nodes.is_empty();
+        self.state = if self.started { OPERATIONAL } else { 127 };
         self.boot_until_ns =
             (self.settings.boot_time_ns > 0).then(|| now_ns.saturating_add(self.settings.boot_time_ns));
         for node in &mut self.nodes {

@@ -30,6 +30,7 @@ name = "NAME"
 name = "fast"
 kind = "can"
 backend = "virtual"
+max_rate = 1000000                     # the default of 150,000 frames/s would be the limit: 1.05 MB/s
 
 [[service]]
 name = "wire"
