@@ -7,8 +7,14 @@ export PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
 export HOME=/tmp
 mount -t proc proc /proc
 mount -t sysfs sysfs /sys
-# The host's /tmp is hidden from here on.
+# The host's /tmp is hidden from here on, but for the folders below it that hold what is to be run.
+needed=$(for path in "$WORK" "$SCRIPT" "$DINRAIL" "$PYTHON"; do
+    case $path in /tmp/*) path=${path#/tmp/} && echo "${path%%/*}" ;; esac
+done | sort -u)
 mount -t tmpfs -o mode=1777,exec tmpfs /tmp
+for folder in $needed; do
+    mkdir -p "/tmp/$folder" && mount -t hostfs -o "/tmp/$folder" none "/tmp/$folder"
+done
 mkdir -p /dev/shm /dev/pts
 mount -t tmpfs -o mode=1777 tmpfs /dev/shm
 mount -t devpts devpts /dev/pts
