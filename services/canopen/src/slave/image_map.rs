@@ -39,6 +39,8 @@ pub struct ImageMap {
     pub input_ranges: Vec<ImageRange>,
     pub output_ranges: Vec<ImageRange>,
     gathered: usize,
+    /// Objects that an image changed; kept so that an image allocates nothing.
+    changed: Vec<(u16, u8)>,
 }
 
 /// Resolves the table; entries with a mistake are left out.
@@ -111,6 +113,7 @@ pub fn plan(
     }
     let values = map.tail.len();
     map.tail.resize(values + map.inputs.len(), Quality::NoData as u8);
+    map.changed.reserve_exact(map.outputs.len());
     map
 }
 
@@ -174,19 +177,19 @@ impl ImageMap {
     }
 
     /// Puts gathered outputs into the objects; what changed is an event of the device's transmit PDOs.
-    pub fn apply(&self, t_ns: u64, node: &mut Node, gathered: &[u8], out: &mut Outbox) {
+    pub fn apply(&mut self, t_ns: u64, node: &mut Node, gathered: &[u8], out: &mut Outbox) {
         // First all values, then the events: a PDO of several objects goes out whole.
-        let mut changed = Vec::new();
+        self.changed.clear();
         for point in &self.outputs {
             let Some(value) = gathered.get(point.at..point.at + point.bytes) else { continue };
             let size = node.get(point.entry).len().min(value.len());
             if node.get(point.entry)[..size] != value[..size]
                 && node.set_quietly(point.entry, &value[..size]).is_ok()
             {
-                changed.push((point.index, point.sub));
+                self.changed.push((point.index, point.sub));
             }
         }
-        for (index, sub) in changed {
+        for &(index, sub) in &self.changed {
             node.changed(t_ns, index, sub, out);
         }
     }
