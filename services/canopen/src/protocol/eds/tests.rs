@@ -444,6 +444,16 @@ fn numbers_of_every_kind() {
     }
 }
 
+#[test]
+fn bits_of_a_real_stay_as_they_are() {
+    let signalling = [0, 0, 0x81, 0x7F];
+    let text = value::format(DataType::Real32, &signalling).unwrap();
+    assert_eq!(text, "0x7F810000");
+    assert_eq!(value::parse(&text, DataType::Real32).unwrap().0.unwrap().bytes, signalling);
+    assert!(value::parse("0x17F810000", DataType::Real32).is_err());
+    assert_eq!(value::parse("1,5", DataType::Real32).unwrap().0.unwrap().bytes, 1.5_f32.to_le_bytes());
+}
+
 proptest! {
     #[test]
     fn any_bytes_are_read_or_refused(bytes: Vec<u8>) {
@@ -480,6 +490,7 @@ proptest! {
         }
     }
 
+    /// Also a signalling NaN, whose bits a conversion to another width would change.
     #[test]
     fn a_formatted_value_reads_back(index in 1u16..0x1C, bytes: [u8; 8]) {
         let data_type = DataType::from_index(index);

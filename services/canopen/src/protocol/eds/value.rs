@@ -81,8 +81,8 @@ pub(super) fn parse(text: &str, data_type: DataType) -> Parsed<Option<Value>> {
             Ok((plain(value.to_le_bytes()[..6].to_vec()), remark))
         }
         _ if data_type.is_real() => {
-            let (number, remark) = real(text, data_type)?;
-            Ok((encode(Number::Real(number), data_type).and_then(plain), remark))
+            let (bytes, remark) = real(text, data_type)?;
+            Ok((bytes.and_then(plain), remark))
         }
         DataType::Boolean if text.eq_ignore_ascii_case("true") => Ok((plain(vec![1]), None)),
         DataType::Boolean if text.eq_ignore_ascii_case("false") => Ok((plain(vec![0]), None)),
@@ -161,25 +161,25 @@ fn formula(text: &str) -> Result<(i128, bool, Option<String>), String> {
     Ok((sum, true, remark))
 }
 
-/// A real, decimal or as its bits in hexadecimal.
-fn real(text: &str, data_type: DataType) -> Parsed<f64> {
+/// A real, decimal or as its bits in hexadecimal. Bits are taken as they are: a conversion would make a signalling
+/// NaN a quiet one.
+fn real(text: &str, data_type: DataType) -> Parsed<Option<Vec<u8>>> {
     let (number, remark) = strip(text);
     if let Some(digits) = number.strip_prefix("0x").or_else(|| number.strip_prefix("0X")) {
         let bits = u64::from_str_radix(digits, 16).map_err(|_| format!("'{number}' is no number"))?;
-        let value = match data_type {
-            DataType::Real32 => f64::from(f32::from_bits(
-                u32::try_from(bits).map_err(|_| format!("'{number}' has more than 32 bits"))?,
-            )),
-            _ => f64::from_bits(bits),
-        };
-        return Ok((value, remark));
+        let size = data_type.size().unwrap_or(8);
+        if size < 8 && bits >> (8 * size) != 0 {
+            return Err(format!("'{number}' has more than {} bits", 8 * size));
+        }
+        return Ok((Some(bits.to_le_bytes()[..size].to_vec()), remark));
     }
+    let encoded = |value| encode(Number::Real(value), data_type);
     if let Ok(value) = number.parse() {
-        return Ok((value, remark));
+        return Ok((encoded(value), remark));
     }
     let dotted = number.replace(',', ".");
     let value = dotted.parse().map_err(|_| format!("'{}' is no number", super::ini::short(text)))?;
-    Ok((value, Some(format!("'{number}' has a decimal comma: taken as a point"))))
+    Ok((encoded(value), Some(format!("'{number}' has a decimal comma: taken as a point"))))
 }
 
 /// Pairs of hexadecimal digits, with or without blanks between them or a `0x` in front.
