@@ -305,6 +305,190 @@ fn several_buses_filters_statistics_and_changes() {
     assert_eq!(stack.take_down(), 0);
 }
 
+const CANOPEN: &str = r#"
+[stack]
+name = "NAME"
+
+[[service]]
+name = "can0"
+kind = "can"
+backend = "virtual"
+bitrate = "1M"
+
+[[service]]
+name = "node5"
+kind = "canopen-slave"
+node_id = 5
+simulate = "401"
+
+[[service]]
+name = "io"
+kind = "canopen-master"
+node_id = 1
+sync_period = "20ms"
+
+[[service.node]]
+id = 5
+eds = "io401.eds"
+heartbeat = "50ms"
+map = [{ object = "6000:01", to = "%IB0", symbol = "Buttons" }, { object = "6200:01", from = "%QB0", symbol = "Lamps" }]
+
+[[service]]
+name = "plc"
+kind = "plc"
+"#;
+
+fn canopen_stack(name: &str) -> Stack {
+    let scratch = Scratch::new(name);
+    let eds = Path::new(env!("CARGO_MANIFEST_DIR")).join("stacks/canopen-io/io401.eds");
+    fs::copy(eds, scratch.0.join("io401.eds")).unwrap();
+    let stack = Stack::spawn_in(name, CANOPEN, scratch, &[]);
+    stack.wait_ready();
+    stack
+}
+
+/// Identifiers that a command showed as JSON lines.
+fn ids(lines: &str) -> std::collections::BTreeSet<u64> {
+    let rows = lines.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
+    rows.map(|row| row["id"].as_u64().unwrap()).collect()
+}
+
+#[test]
+fn names_of_canopen_are_filters_and_frames_of_others_are_no_disorder() {
+    let mut stack = canopen_stack("named");
+    let dump = |filter: &str| {
+        ids(&stack.ok(&["can", "dump", "--json", "--filter", filter, "-n", "6", "--for", "20s"]))
+    };
+    let set = |ids: &[u64]| ids.iter().copied().collect::<std::collections::BTreeSet<u64>>();
+    assert_eq!(dump("heartbeat node 5"), set(&[0x705]));
+    assert_eq!(dump("SYNC"), set(&[0x80]));
+    assert_eq!(dump("heartbeat,!heartbeat 1"), set(&[0x705]));
+    // What is shown is what is taken, by the mapped object's name, too.
+    stack.wait("the master's outputs reach the bus", || {
+        let line = stack.ok(&["can", "dump", "--json", "--filter", "lamps", "-n", "1", "--for", "5s"]);
+        let row: Value = serde_json::from_str(line.lines().next()?).unwrap();
+        assert_eq!((&row["id"], &row["id_text"]), (&0x205.into(), &"205".into()), "{row}");
+        (row["names"]["RPDO1 5"].is_null() && row["names"]["Lamps"] == "0").then_some(())
+    });
+    let stats = stack.ok(&["can", "stats", "--filter", "heartbeat 5", "--for", "1s", "--json"]);
+    let stats: Value = serde_json::from_str(&stats).unwrap();
+    assert_eq!(stats["ids"].as_array().unwrap().len(), 1, "{stats}");
+    assert_eq!(stats["ids"][0]["names"], serde_json::json!({ "heartbeat 5": null }));
+    let sniff = stack.ok(&["can", "sniff", "--filter", "node 5", "--for", "1s", "--json"]);
+    assert!(ids(&sniff).iter().all(|id| id & 0x7F == 5), "{sniff}");
+    let row: Value = serde_json::from_str(sniff.lines().next().unwrap()).unwrap();
+    assert!(row["names"].is_object() && !row["data"].as_str().unwrap().contains(' '), "{row}");
+    let output = stack.cli(&["can", "dump", "--filter", "heartbeet 5"]);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(2) && said.contains("did you mean 'heartbeat 5'?"), "{said}");
+    assert!(said.contains("nodes in this stack: 1, 5"), "{said}");
+
+    // The heartbeat of the node comes meanwhile, equal to the replayed one.
+    let log: String = (0..40u64)
+        .map(|i| {
+            format!("({}.{:03}) can0 {}\n", 1 + i / 20, i % 20 * 50, ["705#05", "123#01"][i as usize % 2])
+        })
+        .collect();
+    let log = stack.scratch.write("beats.log", log);
+    let output = stack.cli(&["can", "replay", text(&log), "--json"]);
+    let (said, why) = (
+        String::from_utf8_lossy(&output.stdout).into_owned(),
+        String::from_utf8_lossy(&output.stderr).into_owned(),
+    );
+    assert_eq!(output.status.code(), Some(0), "{said}{why}");
+    let said: Value = serde_json::from_str(&said).unwrap();
+    let counts = &said["buses"]["can0"];
+    assert_eq!(
+        (&counts["sent"], &counts["echoed"], &counts["out_of_order"]),
+        (&40.into(), &40.into(), &0.into())
+    );
+    assert!(counts["equal_from_others"].as_u64().unwrap() > 0, "{said}");
+    assert!(
+        why.contains("equal to these came from another sender of the stack (") && why.contains("io"),
+        "{why}"
+    );
+
+    // What the log does not tell is not made up; nothing sent is no success.
+    let say = |args: &[&str]| {
+        let output = stack.cli(args);
+        (output.status.code().unwrap(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    let (code, said) = say(&["can", "replay", text(&log), "--received-only"]);
+    assert!(code == 2 && said.contains("does not tell sent frames from received ones"), "{said}");
+    let imported = stack.scratch.0.join("beats.mcap");
+    ok(&["recordings", "import", text(&log), "-o", text(&imported)]);
+    let (code, said) = say(&["can", "replay", text(&imported), "--filter", "#rx"]);
+    assert!(code == 2 && said.contains("--filter #tx or #rx cannot be applied"), "{said}");
+    let (code, said) = say(&["can", "replay", text(&log), "--filter", "7F0"]);
+    assert!(code == 1 && said.contains("nothing was sent: every frame was left out by --filter"), "{said}");
+    let told = stack.scratch.write("told.log", "(1.0) can0 123#01 T\n(1.1) can0 124#02 R\n");
+    let said: Value =
+        serde_json::from_str(&stack.ok(&["can", "replay", text(&told), "--received-only", "--json"]))
+            .unwrap();
+    assert_eq!((&said["buses"]["can0"]["sent"], &said["left_out"]["not_wanted"]), (&1.into(), &1.into()));
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn several_writes_are_one_or_none() {
+    let mut stack = canopen_stack("plcwrite");
+    let read = |var: &str| stack.ok(&["plc", "read", var]).trim().to_owned();
+    let output = stack.cli(&["plc", "write", "%MW0=1", "%MB2=bad", "%MW2=3", "%MB9999=1"]);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("nothing was written: '%MB2' is USINT; \"bad\" does not fit"), "{said}");
+    assert!(said.contains("'%MB9999': this place is beyond the end of its area"), "{said}");
+    assert_eq!((read("%MW0"), read("%MW2")), ("%MW0 = 0".to_owned(), "%MW2 = 0".to_owned()));
+    let said = stack.ok(&["plc", "write", "%MW0=1", "%MX2.3=TRUE", "%MW2=16#FF", "Lamps=5", "--json"]);
+    let said: Value = serde_json::from_str(&said).unwrap();
+    assert_eq!((&said["one_scan"], said["written"].as_array().unwrap().len()), (&true.into(), 4), "{said}");
+    for (var, value) in [("%MW0", 1), ("%MB2", 8), ("%MW2", 255), ("%QB0", 5)] {
+        assert_eq!(read(var), format!("{var} = {value}"));
+    }
+    let many: Vec<String> = (0..17).map(|i| format!("%MW{}=7", 2 * i)).collect();
+    let args: Vec<&str> = ["plc", "write"].into_iter().chain(many.iter().map(String::as_str)).collect();
+    let output = stack.cli(&args);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(
+        output.status.code() == Some(2) && said.contains("17 assignments do not fit one message"),
+        "{said}"
+    );
+    assert_eq!(read("%MW0"), "%MW0 = 1");
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn logs_tell_who_sent_a_frame() {
+    let scratch = Scratch::new("direction");
+    let log =
+        scratch.write("told.log", "(0000000001.000000) can0 123#01 T\n(0000000001.100000) can0 124#02 R\n");
+    let recording = scratch.0.join("told.mcap");
+    ok(&["recordings", "import", text(&log), "-o", text(&recording)]);
+    let exported = ok(&["recordings", "export", text(&recording), "--direction"]);
+    assert_eq!(exported, fs::read_to_string(&log).unwrap());
+    assert_eq!(
+        ok(&["recordings", "export", text(&recording)]),
+        exported.replace(" T\n", "\n").replace(" R\n", "\n")
+    );
+    let info = ok(&["recordings", "info", text(&recording)]);
+    assert!(
+        info.contains("  imported   from told.log (candump log), host ") && !info.contains("build"),
+        "{info}"
+    );
+    let untold = scratch.write("untold.log", "(0000000001.000000) can0 123#01\n");
+    ok(&["recordings", "import", text(&untold), "-o", text(&recording), "--force"]);
+    let info = ok(&["recordings", "info", text(&recording)]);
+    assert!(
+        info.contains("(candump log), host ") && info.contains("does not tell sent frames from received"),
+        "{info}"
+    );
+    // Nothing is made up.
+    let exported = ok(&["recordings", "export", text(&recording), "--direction"]);
+    assert_eq!(exported, "(0000000001.000000) can0 123#01\n");
+    let (code, said) = refused(&["recordings", "export", text(&recording), "--format", "asc", "--direction"]);
+    assert!(code == 2 && said.contains("an ASC file always tells the direction"), "{said}");
+}
+
 /// A log with every kind of frame that the formats have in common: python-can takes an empty FD frame of an ASC file for a
 /// remote one.
 fn mix() -> String {

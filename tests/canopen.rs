@@ -4,88 +4,18 @@
 
 mod support;
 
+use rustix::process::Signal;
 use std::fs;
-use std::io::{BufRead, BufReader, Read, Write};
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
-use std::sync::{Arc, Mutex};
-use std::time::Duration;
-use support::peers::{peer, program};
-use support::{Scratch, Stack, free_port, skip, wait_for};
+use std::process::Command;
+use support::canopen::{
+    DEVICE_PROGRAM, DEVICES, becomes, exchanges, log_has, long_value, object as object_of, path, refused,
+    there_and_back,
+};
+use support::peers::{Peer, peer, program};
+use support::{Scratch, Stack, free_port, skip};
 
-/// Transfers of a megabyte by interpreted programs, on a machine that is shared.
-const LONG: Duration = Duration::from_mins(2);
 const EDS: &str = include_str!("../launcher/stacks/canopen-io/io401.eds");
-
-/// A foreign program with what it said so far; killed when dropped.
-struct Peer {
-    child: Child,
-    said: Arc<Mutex<Vec<String>>>,
-    /// Lines already waited for.
-    taken: usize,
-}
-
-impl Peer {
-    fn start(mut command: Command) -> Self {
-        let mut child =
-            command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-        let said = Arc::new(Mutex::new(Vec::new()));
-        let pipes: [Box<dyn Read + Send>; 2] =
-            [Box::new(child.stdout.take().unwrap()), Box::new(child.stderr.take().unwrap())];
-        for pipe in pipes {
-            let said = Arc::clone(&said);
-            std::thread::spawn(move || {
-                for line in BufReader::new(pipe).lines().map_while(Result::ok) {
-                    said.lock().unwrap().push(line);
-                }
-            });
-        }
-        Self { child, said, taken: 0 }
-    }
-
-    fn all(&self) -> Vec<String> {
-        self.said.lock().unwrap().clone()
-    }
-
-    /// Waits until it says this line, after those waited for before.
-    fn says(&mut self, line: &str) {
-        let start = std::time::Instant::now();
-        loop {
-            let said = self.all();
-            if let Some(at) = said[self.taken..].iter().position(|l| l == line) {
-                self.taken += at + 1;
-                return;
-            }
-            let ended = self.child.try_wait().unwrap().is_some();
-            assert!(
-                !ended && start.elapsed() < LONG,
-                "waited in vain for '{line}'; the peer {}said:\n{}",
-                if ended { "ended and " } else { "" },
-                said.join("\n")
-            );
-            std::thread::sleep(Duration::from_millis(10));
-        }
-    }
-
-    fn tell(&mut self, line: &str) {
-        let pipe = self.child.stdin.as_mut().unwrap();
-        writeln!(pipe, "{line}").unwrap();
-        pipe.flush().unwrap();
-    }
-
-    /// Waits until it ends well.
-    fn ends(mut self) {
-        let status = wait_for("the end of the peer", LONG, || self.child.try_wait().unwrap());
-        assert!(status.success(), "{}", self.all().join("\n"));
-    }
-}
-
-impl Drop for Peer {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
 
 /// Ports of the servers of a bus.
 struct Ports {
@@ -125,41 +55,6 @@ fn python_master(ports: &Ports, interface: &str, eds: &Path, parts: &[&str]) -> 
     Some(Peer::start(command))
 }
 
-const DEVICES: &str = r#"
-[[service]]
-name = "simulated"
-kind = "canopen-slave"
-node_id = 2
-simulate = "401"
-serial_number = 7
-
-[[service]]
-name = "device"
-kind = "canopen-slave"
-node_id = 5
-eds = "io401.eds"
-store = "device.store"
-map = [
-    { object = "6200:01", to = "%IB0", symbol = "Lamps" },
-    { object = "6411:01", to = "%IW2", symbol = "Valve" },
-    { object = "6000:01", from = "%QB0", symbol = "Buttons" },
-    { object = "6401:01", from = "%QW2", symbol = "Level" },
-]
-
-[[service]]
-name = "plc"
-kind = "plc"
-program = ["main.st"]
-cycle = "5ms"
-"#;
-
-const PROGRAM: &str = r"
-PROGRAM Device
-  Buttons := Lamps;
-  Level := Valve + 1;
-END_PROGRAM
-";
-
 #[test]
 fn python_canopen_as_master_drives_our_devices() {
     let ports = Ports::new();
@@ -167,7 +62,7 @@ fn python_canopen_as_master_drives_our_devices() {
         return;
     }
     let text = format!("{}{DEVICES}", ports.bus());
-    let mut stack = Stack::up("copymaster", &text, &[("io401.eds", EDS), ("main.st", PROGRAM)]);
+    let mut stack = Stack::up("copymaster", &text, &[("io401.eds", EDS), ("main.st", DEVICE_PROGRAM)]);
     let eds = stack.scratch.0.join("io401.eds");
     let parts = ["nmt", "heartbeat_consumer", "sdo", "pdo"];
     let mut master = python_master(&ports, "cannelloni", &eds, &parts).unwrap();
@@ -178,6 +73,13 @@ fn python_canopen_as_master_drives_our_devices() {
     // Remote frames, by the other protocol that carries them.
     let mut master = python_master(&ports, "slcan", &eds, &["rtr"]).unwrap();
     master.says("rtr");
+    master.ends();
+    let mut master = python_master(&ports, "cannelloni", &eds, &["loss"]).unwrap();
+    master.says("kill it");
+    stack.kill("simulated", Signal::KILL);
+    master.says("start it");
+    stack.ok(&["restart", "simulated"]);
+    master.says("loss");
     master.ends();
     // The device whose inside is a program.
     let mut master = python_master(&ports, "cannelloni", &eds, &["device"]).unwrap();
@@ -251,67 +153,6 @@ cycle = "10ms"
 "#,
         ports.bus()
     )
-}
-
-/// Value of a place of the image, once it is the expected one.
-fn becomes(stack: &Stack, place: &str, expected: i64) {
-    let expected = format!("{place} = {expected}");
-    stack.wait(&expected, || {
-        let said = stack.cli(&["plc", "read", place]).stdout;
-        (String::from_utf8_lossy(&said).trim() == expected).then_some(())
-    });
-}
-
-/// Whatever is written to outputs comes back at inputs, over the bus and through the foreign device.
-fn exchanges(stack: &Stack, pairs: &[(&str, &str)]) {
-    for value in [17i64, 85] {
-        for (i, (output, _)) in pairs.iter().enumerate() {
-            stack.ok(&["plc", "write", &format!("{output}={}", value + i as i64)]);
-        }
-        for (i, (_, input)) in pairs.iter().enumerate() {
-            becomes(stack, input, value + i as i64);
-        }
-    }
-}
-
-fn log_has(stack: &Stack, text: &str) {
-    stack.wait(&format!("'{text}' in the log"), || stack.log().contains(text).then_some(()));
-}
-
-/// Bytes that repeat nowhere, so that a lost or doubled segment shows.
-fn long_value(bytes: usize) -> Vec<u8> {
-    let mut state = 0x1234_5678_9ABC_DEF1u64;
-    let mut out = Vec::with_capacity(bytes + 8);
-    while out.len() < bytes {
-        state ^= state << 13;
-        state ^= state >> 7;
-        state ^= state << 17;
-        out.extend_from_slice(&state.to_le_bytes());
-    }
-    out.truncate(bytes);
-    out
-}
-
-/// Writes and reads a long value by the command line.
-fn there_and_back(stack: &Stack, node: &str, bytes: usize, mode: &str) {
-    let value = long_value(bytes);
-    let file = stack.scratch.write("value.bin", &value);
-    let back = stack.scratch.0.join("back.bin");
-    stack.ok(&["canopen", "sdo", "write", node, "2000", "--input", path(&file), "--mode", mode]);
-    stack.ok(&["canopen", "sdo", "read", node, "2000", "--output", path(&back), "--mode", mode]);
-    assert_eq!(fs::read(&back).unwrap().len(), bytes);
-    assert!(fs::read(&back).unwrap() == value, "{bytes} bytes to node {node}, {mode}");
-}
-
-fn path(path: &Path) -> &str {
-    path.to_str().unwrap()
-}
-
-/// Text of a command that must fail.
-fn refused(stack: &Stack, args: &[&str]) -> String {
-    let output = stack.cli(args);
-    assert!(!output.status.success(), "{args:?} succeeded");
-    String::from_utf8(output.stderr).unwrap()
 }
 
 fn python_slave(ports: &Ports, stack: &Stack, node: u8) -> Peer {
@@ -405,6 +246,65 @@ fn our_master_drives_devices_made_of_python_canopen() {
     first.says("reset");
     first.says("operational 0xcafe");
     comes_and_goes(&stack, &ports, first, &mut second);
+    assert_eq!(stack.take_down(), 0, "{}", stack.log());
+}
+
+/// Every transmission type both ways, spread over three devices: what the master is asked to set, and the way the values
+/// of 6200h and 6411h go and come back.
+const KINDS: [(u8, [u8; 2], [u8; 2]); 3] =
+    [(14, [253, 252], [254, 0]), (15, [254, 3], [1, 5]), (16, [0, 255], [255, 240])];
+
+#[test]
+fn every_kind_of_pdo_with_devices_made_of_python_canopen() {
+    if peer("canopen_slave.py").is_none() {
+        return;
+    }
+    let ports = Ports::new();
+    let mut nodes = String::new();
+    let mut pairs = Vec::new();
+    for (i, (id, tpdo, rpdo)) in KINDS.iter().enumerate() {
+        let (state, byte, word) = (30 + i, i, 10 + i);
+        nodes.push_str(&format!(
+            r#"
+[[service.node]]
+id = {id}
+eds = "io401.eds"
+heartbeat = "500ms"
+status_to = "%IB{state}"
+tpdo = [{{ number = 1, transmission = {} }}, {{ number = 2, transmission = {} }}]
+rpdo = [{{ number = 1, transmission = {} }}, {{ number = 2, transmission = {} }}]
+map = [
+    {{ object = "6000:01", to = "%IB{byte}" }},
+    {{ object = "6401:01", to = "%IW{word}" }},
+    {{ object = "6200:01", from = "%QB{byte}" }},
+    {{ object = "6411:01", from = "%QW{word}" }},
+]
+"#,
+            tpdo[0], tpdo[1], rpdo[0], rpdo[1]
+        ));
+        pairs.push((format!("%QB{byte}"), format!("%IB{byte}")));
+        pairs.push((format!("%QW{word}"), format!("%IW{word}")));
+    }
+    let pairs: Vec<(&str, &str)> = pairs.iter().map(|(q, i)| (q.as_str(), i.as_str())).collect();
+    let mut stack = Stack::spawn("copykinds", &our_master(&ports, &nodes), &[("io401.eds", EDS)]);
+    stack.wait("the bus at work", || stack.is_ready("can0").then_some(()));
+    let devices: Vec<Peer> = KINDS.iter().map(|(id, ..)| python_slave(&ports, &stack, *id)).collect();
+    for state in 30..33 {
+        becomes(&stack, &format!("%IB{state}"), 5);
+    }
+    exchanges(&stack, &pairs);
+    for (id, tpdo, rpdo) in KINDS {
+        for (object, expected) in
+            [("1800:02", tpdo[0]), ("1801:02", tpdo[1]), ("1400:02", rpdo[0]), ("1401:02", rpdo[1])]
+        {
+            assert_eq!(
+                object_of(&stack, id, object).as_deref(),
+                Some(&*expected.to_string()),
+                "{id} {object}"
+            );
+        }
+    }
+    drop(devices);
     assert_eq!(stack.take_down(), 0, "{}", stack.log());
 }
 
@@ -502,6 +402,25 @@ fn our_master_drives_devices_made_of_durand() {
     );
 }
 
+#[test]
+fn eight_devices_made_of_durand_without_node_id_are_found_by_our_master() {
+    let Some(mut command) = peer("durand_slave.py") else { return };
+    let ports = Ports::new();
+    let stack = Stack::up("codurand8", &our_master(&ports, ""), &[]);
+    command.args([&ports.cannelloni, "255"]).args((101..=108).map(|serial| serial.to_string()));
+    let mut devices = Peer::start(command);
+    devices.says("ready");
+    let found = stack.ok(&["canopen", "lss", "fastscan", "--from", "20"]);
+    for serial in 101..=108 {
+        let line = format!("serial 0x{serial:08X}  -> node-id {}", serial - 101 + 20);
+        assert!(found.contains(&line), "{line} is not in\n{found}");
+    }
+    for node in 20..28 {
+        let said = stack.ok(&["canopen", "sdo", "read", &node.to_string(), "1018:04", "--type", "u32"]);
+        assert!(said.trim().ends_with(&format!("= {}", node - 20 + 101)), "{said}");
+    }
+}
+
 /// node.js with node-canopen, installed once beside the build.
 fn node_canopen() -> Option<Command> {
     let mut command = program("node", "nodejs")?;
@@ -556,12 +475,18 @@ map = [
 
 #[test]
 fn our_master_drives_a_device_made_of_node_canopen() {
-    let Some(mut command) = node_canopen() else { return };
+    if node_canopen().is_none() {
+        return;
+    }
     let ports = Ports::new();
     let stack = Stack::spawn("conode", &our_master(&ports, NODE_NODE), &[("io401.eds", EDS)]);
     stack.wait("the bus at work", || stack.is_ready("can0").then_some(()));
-    command.arg(&ports.cannelloni).arg(stack.scratch.0.join("io401.eds")).args(["13", "13"]);
-    let mut device = Peer::start(command);
+    let start = || {
+        let mut command = node_canopen().unwrap();
+        command.arg(&ports.cannelloni).arg(stack.scratch.0.join("io401.eds")).args(["13", "13"]);
+        Peer::start(command)
+    };
+    let mut device = start();
     device.says("operational 0xbeef");
     becomes(&stack, "%IB33", 5);
     exchanges(&stack, &[("%QB3", "%IB3"), ("%QW5", "%IW5")]);
@@ -569,17 +494,27 @@ fn our_master_drives_a_device_made_of_node_canopen() {
     assert_eq!(name.trim(), "1008:00 Manufacturer device name = Simulated I/O");
     assert!(refused(&stack, &["canopen", "sdo", "read", "13", "5000"]).contains("06020000h"));
     there_and_back(&stack, "13", 10_240, "segmented");
-    // Only to it by block: its own block upload ends the whole program now and then.
+    // Only to it by block: its own block upload ends the whole program now and then. And no megabyte: it stands still for
+    // so long meanwhile that it is lost.
     let value = long_value(10_241);
     let file = stack.scratch.write("value.bin", &value);
     let back = stack.scratch.0.join("back.bin");
     stack.ok(&["canopen", "sdo", "write", "13", "2000", "--input", path(&file), "--mode", "block"]);
     stack.ok(&["canopen", "sdo", "read", "13", "2000", "--output", path(&back), "--mode", "segmented"]);
     assert!(fs::read(&back).unwrap() == value);
+    device.tell("emcy");
+    log_has(
+        &stack,
+        "node 13 (Simulated I/O) reports emergency 4210h, temperature; error register 00h, vendor bytes 6865617421",
+    );
     stack.ok(&["canopen", "nmt", "reset-node", "13"]);
     device.says("booted");
     device.says("operational 0xbeef");
     drop(device);
     log_has(&stack, "node 13 (Simulated I/O) is lost: it sends no heartbeat any more");
     becomes(&stack, "%IB33", 0);
+    let mut device = start();
+    device.says("operational 0xbeef");
+    becomes(&stack, "%IB33", 5);
+    exchanges(&stack, &[("%QB3", "%IB3"), ("%QW5", "%IW5")]);
 }

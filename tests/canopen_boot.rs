@@ -4,11 +4,12 @@
 mod support;
 
 use rustix::process::Signal;
-use support::Stack;
+use serde_json::Value;
 use support::canopen::{
     BUS, ErrorControl, HELD, IO401, node, object, said, slave, status, wait_operational, wait_said,
     wait_said_times, wait_state,
 };
+use support::{Stack, free_port, recorded_events};
 
 const MASTER: &str = r#"
 [[service]]
@@ -214,8 +215,13 @@ fn a_node_that_dies_while_it_is_configured_is_named_and_booted_when_it_is_back()
 
 #[test]
 fn two_devices_with_one_node_id_are_told_by_device_and_master() {
-    let slaves =
-        [slave("n5a", 5, "serial_number = 1"), slave("n5b", 5, "serial_number = 2"), slave("n6", 6, "")];
+    let recorder = "\n[[service]]\nname = \"rec\"\nkind = \"recorder\"\ndir = \"recordings\"\n".to_owned();
+    let slaves = [
+        slave("n5a", 5, "serial_number = 1"),
+        slave("n5b", 5, "serial_number = 2"),
+        slave("n6", 6, ""),
+        recorder,
+    ];
     let master = expected_node(5, "") + &expected_node(6, "mandatory = true");
     let mut stack = troubled("twins", &slaves, &master);
     wait_operational(&stack, &[6]);
@@ -225,6 +231,17 @@ fn two_devices_with_one_node_id_are_told_by_device_and_master() {
     assert!(!said(&stack, "n6").contains("another device"), "{}", said(&stack, "n6"));
     assert!(!said(&stack, "io").contains("two devices seem to have node-id 6"), "{}", said(&stack, "io"));
     assert_eq!(stack.take_down(), 0);
+    // Everybody on the rail was told, too.
+    let events = recorded_events(&stack);
+    let twins = |service: &str, text: &str, level: &str| {
+        let told = |e: &Value| {
+            e["service"] == service && e["level"] == level && e["message"].as_str().unwrap().contains(text)
+        };
+        assert!(events.iter().any(told), "{service}: {text}: {events:#?}");
+    };
+    twins("io", "two devices seem to have node-id 5", "fault");
+    twins("n5a", "another device on the bus has node-id 5 too", "fault");
+    twins("n5b", "another device on the bus has node-id 5 too", "fault");
 }
 
 #[test]
@@ -279,6 +296,87 @@ fn a_restarted_master_takes_the_running_network_over_and_boots_what_does_not_run
     assert_eq!((watch.boot_ups(2), watch.boot_ups(3)), (0, 1), "{:?}", watch.frames());
     drop(watch);
     assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn nodes_without_a_master_do_what_they_are_told_to() {
+    // Without a heartbeat of the master for three of its periods: node 2 goes to pre-operational, node 3 stays
+    // (1029h:01).
+    let nodes = NODES.replacen("id = 3\n", "id = 3\nsdo = [{ object = \"1029:01\", value = 1 }]\n", 1);
+    let toml = [
+        BUS,
+        &slave("n2", 2, HELD),
+        &slave("n3", 3, HELD),
+        MASTER,
+        "heartbeat = \"100ms\"\n",
+        HELD,
+        &nodes,
+        PLC,
+    ]
+    .concat();
+    let mut stack = Stack::up("masterless", &toml, &[("main.st", PROGRAM), ("io401.eds", IO401)]);
+    wait_operational(&stack, &[2, 3]);
+    wait_exchange(&stack);
+    let watch = ErrorControl::watch(&stack);
+    stack.kill("io", Signal::KILL);
+    stack.wait("node 2 pre-operational", || watch.frames().contains(&"702#7F".to_owned()).then_some(()));
+    wait_said(&stack, "n2", "8130h");
+    wait_said(&stack, "n3", "8130h");
+    let frames = watch.frames().len();
+    stack.wait("more heartbeats", || {
+        let later = watch.frames().split_off(frames);
+        (later.iter().filter(|f| f.starts_with("703#")).count() > 5).then_some(())
+    });
+    assert!(watch.frames().iter().all(|f| !f.starts_with("703#") || f == "703#05"), "{:?}", watch.frames());
+    // The restarted master leaves the one running and boots the other.
+    stack.ok(&["restart", "io"]);
+    wait_operational(&stack, &[2, 3]);
+    wait_exchange(&stack);
+    wait_said(&stack, "io", "node 3 (Simulated I/O) was running already and is left running");
+    assert_eq!((watch.boot_ups(2), watch.boot_ups(3)), (1, 0), "{:?}", watch.frames());
+    drop(watch);
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn a_new_master_keeps_alive_what_it_is_told_to() {
+    // The nodes are a stack of their own, so that a master can begin from cold beside them.
+    let port = free_port();
+    let serve = format!("serve = {{ socketcand = \"127.0.0.1:{port}\" }}\n");
+    let nodes = [BUS, &serve, &slave("n2", 2, ""), &slave("n3", 3, "")].concat();
+    let mut nodes = Stack::up("keptnodes", &nodes, &[]);
+    let bus = BUS.replace(
+        "backend = \"virtual\"",
+        &format!("backend = \"socketcand\"\ninterface = \"tcp://127.0.0.1:{port}/can0\""),
+    );
+    // A heartbeat so slow that no node misses its master.
+    let master = [&bus, MASTER, "heartbeat = \"10s\"\n", HELD, NODES, PLC].concat();
+    let begin = |toml: &str| {
+        let stack = Stack::spawn("keeper", toml, &[("main.st", PROGRAM), ("io401.eds", IO401)]);
+        wait_operational(&stack, &[2, 3]);
+        wait_exchange(&stack);
+        stack
+    };
+    let end = |mut stack: Stack| {
+        stack.kill("io", Signal::KILL);
+        stack.wait("a dead master", || (stack.service("io")?["state"] != "running").then_some(()));
+        // A service that is held at the end makes the exit code 1.
+        stack.take_down();
+    };
+    end(begin(&master));
+    let watch = ErrorControl::watch(&nodes);
+    // Node 2 is kept alive (1F81h bit 4), node 3 is reset.
+    let stack = begin(&master.replacen("id = 2\n", "id = 2\nkeep_alive = true\n", 1));
+    wait_said(&stack, "io", "node 2 (Simulated I/O) was running already and is left running");
+    wait_said(&stack, "io", "node 3 (Simulated I/O) is booted");
+    assert!(watch.frames().iter().all(|f| !f.starts_with("702#") || f == "702#05"), "{:?}", watch.frames());
+    assert_eq!((watch.boot_ups(2), watch.boot_ups(3)), (0, 1), "{:?}", watch.frames());
+    end(stack);
+    // And a master that keeps nobody resets both.
+    end(begin(&master));
+    assert_eq!((watch.boot_ups(2), watch.boot_ups(3)), (1, 2), "{:?}", watch.frames());
+    drop(watch);
+    assert_eq!(nodes.take_down(), 0);
 }
 
 #[test]

@@ -5,39 +5,34 @@
 mod support;
 
 use serde_json::Value;
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
-use std::process::{Child, Command, Stdio};
+use std::path::Path;
+use std::process::Command;
 use std::time::Duration;
 use support::modbus::{Answer, Client};
-use support::peers::{peer, program};
-use support::{PATIENCE, Stack, dinrail, free_port, wait_for};
+use support::peers::{Peer, peer, program};
+use support::{PATIENCE, Scratch, Stack, c_peer, dinrail, free_port, wait_for};
 
-/// A foreign server; killed when dropped.
-struct Server(Child);
-
-impl Server {
-    fn start(mut command: Command) -> Self {
-        let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).spawn().unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        assert_eq!(line.trim(), "ready");
-        Self(child)
-    }
-
-    /// pymodbus.
-    fn python(args: &[&str]) -> Option<Self> {
-        let mut command = peer("modbus_serve.py")?;
-        command.args(args);
-        Some(Self::start(command))
-    }
+/// A foreign server that listens; killed when dropped.
+fn listening(command: Command) -> Peer {
+    let mut server = Peer::start(command);
+    server.says("ready");
+    server
 }
 
-impl Drop for Server {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
+/// pymodbus.
+fn pymodbus(args: &[&str]) -> Option<Peer> {
+    let mut command = peer("modbus_serve.py")?;
+    command.args(args);
+    Some(listening(command))
+}
+
+/// libmodbus.
+fn libmodbus(program: &Path, args: &[&str]) -> Peer {
+    let mut command = Command::new(program);
+    command.args(args);
+    listening(command)
 }
 
 /// Value of a variable of the plc, once it is the expected one.
@@ -120,7 +115,7 @@ fn exercise(stack: &Stack) {
 #[test]
 fn a_tcp_server_is_polled_dies_and_comes_back() {
     let port = free_port().to_string();
-    let Some(server) = Server::python(&["tcp", &port, "1", "5"]) else { return };
+    let Some(server) = pymodbus(&["tcp", &port, "1", "5"]) else { return };
     let toml = CLIENT.replace("LINE", &format!("tcp = \"127.0.0.1:{port}\""));
     let stack = Stack::up("mbclient", &toml, &[]);
     exercise(&stack);
@@ -128,7 +123,7 @@ fn a_tcp_server_is_polled_dies_and_comes_back() {
     drop(server);
     becomes(&stack, "%IB100", "1");
     becomes(&stack, "%IW0", "500");
-    let _server = Server::python(&["tcp", &port, "1", "5"]).unwrap();
+    let _server = pymodbus(&["tcp", &port, "1", "5"]).unwrap();
     becomes(&stack, "%IB100", "0");
     stack.ok(&["plc", "write", "%QW0=4712"]);
     wait_for("the value after the restart", PATIENCE, || {
@@ -146,9 +141,32 @@ fn rtu_and_ascii_on_a_serial_line() {
         let stack = Stack::up(&format!("mb{mode}"), &toml, &[]);
         let line = stack.scratch.0.join("line");
         wait_for("the pseudo-terminal", PATIENCE, || line.exists().then_some(()));
-        let Some(_server) = Server::python(&[mode, line.to_str().unwrap(), "1", "5"]) else { return };
+        let Some(_server) = pymodbus(&[mode, line.to_str().unwrap(), "1", "5"]) else { return };
         exercise(&stack);
     }
+}
+
+#[test]
+fn libmodbus_serves_our_master_on_tcp_and_on_a_line() {
+    let scratch = Scratch::new("libmodbus");
+    let Some(program) = c_peer::compiled("libmodbus_unit", &scratch) else { return };
+    let port = free_port().to_string();
+    let server = libmodbus(&program, &["tcp", &port, "5"]);
+    let stack = Stack::up("mblibtcp", &CLIENT.replace("LINE", &format!("tcp = \"127.0.0.1:{port}\"")), &[]);
+    exercise(&stack);
+    drop((stack, server));
+    let toml = CLIENT.replace("LINE", "serial = \"com1\"")
+        + "\n[[service]]\nname = \"com1\"\nkind = \"serial\"\ndevice = \"pty:line\"\n";
+    let stack = Stack::up("mblibrtu", &toml, &[]);
+    let line = stack.scratch.0.join("line");
+    wait_for("the pseudo-terminal", PATIENCE, || line.exists().then_some(()));
+    let server = libmodbus(&program, &["rtu", line.to_str().unwrap(), "5"]);
+    exercise(&stack);
+    // Gone and back, as after a power cut.
+    drop(server);
+    becomes(&stack, "%IB100", "1");
+    let _server = libmodbus(&program, &["rtu", line.to_str().unwrap(), "5"]);
+    becomes(&stack, "%IB100", "0");
 }
 
 const GATEWAY: &str = r#"
@@ -170,12 +188,12 @@ units = [ { tcp = 101, line = 5 } ]
 response_timeout = "300ms"
 "#;
 
-fn gateway_stack() -> Option<(Stack, Server, u16)> {
+fn gateway_stack() -> Option<(Stack, Peer, u16)> {
     let port = free_port();
     let stack = Stack::up("mbgateway", &GATEWAY.replace("PORT", &port.to_string()), &[]);
     let line = stack.scratch.0.join("line");
     wait_for("the pseudo-terminal", PATIENCE, || line.exists().then_some(()));
-    let server = Server::python(&["rtu", line.to_str().unwrap(), "1", "5"])?;
+    let server = pymodbus(&["rtu", line.to_str().unwrap(), "1", "5"])?;
     Some((stack, server, port))
 }
 
@@ -337,7 +355,7 @@ fn a_dead_unit_among_ten_does_not_stop_the_others() {
     let stack = Stack::up("mbdead", &toml, &[]);
     let line = stack.scratch.0.join("line");
     wait_for("the pseudo-terminal", PATIENCE, || line.exists().then_some(()));
-    let Some(_server) = Server::python(&["rtu", line.to_str().unwrap(), "5"]) else { return };
+    let Some(_server) = pymodbus(&["rtu", line.to_str().unwrap(), "5"]) else { return };
     becomes(&stack, "%IW0", "500");
     becomes(&stack, "%IB122", "2");
     // The live unit stays good while the dead one is tried.
@@ -351,7 +369,7 @@ fn a_dead_unit_among_ten_does_not_stop_the_others() {
 #[test]
 fn the_command_line_alone_reads_a_device() {
     let port = free_port();
-    let Some(_server) = Server::python(&["tcp", &port.to_string(), "1"]) else { return };
+    let Some(_server) = pymodbus(&["tcp", &port.to_string(), "1"]) else { return };
     let target = format!("tcp://127.0.0.1:{port}");
     let run = |args: &[&str]| {
         let output = dinrail().args(["modbus"]).args(args).output().unwrap();

@@ -203,7 +203,14 @@ impl Peer {
         self.tally.noise += 1;
         let longest = if self.rng.below(8) == 0 { 700 } else { 40 };
         let n = 1 + self.rng.below(longest);
-        let bytes = self.rng.bytes(n);
+        let mut bytes = self.rng.bytes(n);
+        while self.mode == Mode::Rtu && rtu::is_frame(&bytes) {
+            bytes = self.rng.bytes(n);
+        }
+        if self.mode == Mode::Ascii {
+            // An LF would complete a frame before it that broke off just there.
+            bytes.iter_mut().filter(|b| **b == b'\n').for_each(|b| *b = b'!');
+        }
         self.write(&bytes);
         bytes
     }
@@ -261,9 +268,15 @@ impl Peer {
     }
 
     fn truncated(&mut self) -> Vec<u8> {
-        let mut frame = self.tempting();
-        let keep = 1 + self.rng.below(frame.len() as u64 - 1) as usize;
-        frame.truncate(keep);
+        // One in 65,536 is a whole frame all the same, by its CRC.
+        let frame = loop {
+            let mut frame = self.tempting();
+            let keep = 1 + self.rng.below(frame.len() as u64 - 1) as usize;
+            frame.truncate(keep);
+            if self.mode == Mode::Ascii || !rtu::is_frame(&frame) {
+                break frame;
+            }
+        };
         self.tally.truncated += 1;
         self.write(&frame);
         frame

@@ -8,6 +8,9 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::Duration;
 use support::{Stack, cases, free_port, peers};
+use tokio::net::unix::pipe;
+use tokio_modbus::client::Context;
+use tokio_modbus::prelude::{ExceptionCode, Reader, Slave, Writer};
 
 struct Ports {
     tcp: u16,
@@ -130,6 +133,81 @@ fn mbpoll(args: &[&str]) {
         "mbpoll {args:?}: {text}{}",
         String::from_utf8_lossy(&output.stderr)
     );
+}
+
+/// Reads and writes every table and asks for the identification, by tokio-modbus.
+async fn tokio_modbus_master(mut master: Context, first: u16, what: &str) {
+    let values: Vec<u16> = (0..20).map(|n| n * 257 + first).collect();
+    master.write_multiple_registers(first, &values).await.unwrap().unwrap();
+    assert_eq!(master.read_holding_registers(first, 20).await.unwrap().unwrap(), values, "{what}");
+    master.write_single_register(first, 7).await.unwrap().unwrap();
+    master.masked_write_register(first, 0xFFF0, 0x0008).await.unwrap().unwrap();
+    let both = master.read_write_multiple_registers(first, 2, first + 1, &[9]).await.unwrap().unwrap();
+    assert_eq!(both, [8, 9], "{what}");
+    let coils = [true, false, true, true, false, false, false, true, true];
+    master.write_multiple_coils(first, &coils).await.unwrap().unwrap();
+    master.write_single_coil(first + 1, true).await.unwrap().unwrap();
+    assert_eq!(master.read_coils(first, 4).await.unwrap().unwrap(), [true, true, true, true], "{what}");
+    assert_eq!(master.read_discrete_inputs(0, 3).await.unwrap().unwrap(), [false; 3], "{what}");
+    assert_eq!(master.read_input_registers(0, 2).await.unwrap().unwrap(), [0, 0], "{what}");
+    // An exception, and after it the line still works.
+    let refused = master.read_holding_registers(65_535, 2).await.unwrap();
+    assert_eq!(refused, Err(ExceptionCode::IllegalDataAddress), "{what}");
+    assert_eq!(master.read_holding_registers(first + 19, 1).await.unwrap().unwrap(), values[19..], "{what}");
+}
+
+#[test]
+fn tokio_modbus_is_a_master_on_tcp_and_on_a_line() {
+    let (mut stack, ports) = up();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let address = (std::net::Ipv4Addr::LOCALHOST, ports.tcp).into();
+        let master = tokio_modbus::client::tcp::connect_slave(address, Slave(1)).await.unwrap();
+        tokio_modbus_master(master, 100, "tcp").await;
+        // Several at once.
+        let mut masters = tokio::task::JoinSet::new();
+        for n in 0..4 {
+            let master = tokio_modbus::client::tcp::connect_slave(address, Slave(1)).await.unwrap();
+            masters
+                .spawn(async move { tokio_modbus_master(master, 200 + n * 50, "tcp, four at once").await });
+        }
+        while let Some(ended) = masters.join_next().await {
+            ended.unwrap();
+        }
+        let line = fs::OpenOptions::new().read(true).write(true).open(path(&stack, "com1")).unwrap();
+        rustix::io::ioctl_fionbio(&line, true).unwrap();
+        // Tokio has no type for a terminal; the ends of a pipe read and write any descriptor that can be waited for.
+        let write = pipe::Sender::from_owned_fd_unchecked(line.try_clone().unwrap().into()).unwrap();
+        let read = pipe::Receiver::from_owned_fd_unchecked(line.into()).unwrap();
+        let master = tokio_modbus::client::rtu::attach_slave(tokio::io::join(read, write), Slave(1));
+        tokio_modbus_master(master, 500, "rtu").await;
+    });
+    assert_eq!(stack.take_down(), 0, "{}", stack.log());
+}
+
+#[test]
+fn nmap_discovers_the_units_and_who_they_are() {
+    let (mut stack, ports) = up();
+    let Some(mut nmap) = peers::program("nmap", "nmap") else { return };
+    stack.wait("the server serves", || TcpStream::connect(("127.0.0.1", ports.tcp)).ok());
+    // "+": also on a port that is not 502. Asks all units from 1 to 246, each on its own connections.
+    let output = nmap
+        .args(["-n", "-Pn", "-sT", "-p", &ports.tcp.to_string(), "--script", "+modbus-discover"])
+        .args(["--script-args", "modbus-discover.aggressive=true", "-oX", "-", "127.0.0.1"])
+        .output()
+        .unwrap();
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stderr));
+    let of_unit = |unit: u8| {
+        let (_, rest) = text.split_once(&format!("<table key=\"sid {unit:#x}\">"))?;
+        rest.split_once("</table>").map(|(own, _)| own.to_owned())
+    };
+    for unit in [1, 5] {
+        let own = of_unit(unit).unwrap_or_else(|| panic!("unit {unit} is missing: {text}"));
+        assert!(own.contains("<elem key=\"Device identification\">Works P1 7"), "unit {unit}: {own}");
+        assert!(own.contains("<elem key=\"Slave ID data\">"), "unit {unit}: {own}");
+    }
+    assert_eq!(stack.take_down(), 0, "{}", stack.log());
 }
 
 /// PDUs of the matrix of disagreements that need no state, and what V1.1b3 asks for.

@@ -102,3 +102,48 @@ impl EventBody {
         }
     }
 }
+
+/// So many events a second may go to the rail; the others are counted, so that a storm of them costs one sentence.
+#[derive(Debug, Clone, Copy)]
+pub struct Budget {
+    a_second: u32,
+    left: u32,
+    left_out: u32,
+}
+
+impl Budget {
+    pub const fn new(a_second: u32) -> Self {
+        Self { a_second, left: a_second, left_out: 0 }
+    }
+
+    /// Whether one more event may go now.
+    pub fn take(&mut self) -> bool {
+        if self.left == 0 {
+            self.left_out = self.left_out.saturating_add(1);
+            return false;
+        }
+        self.left -= 1;
+        true
+    }
+
+    /// Call once a second: how many events were left out in the last one; `None`: none.
+    pub fn renew(&mut self) -> Option<u32> {
+        let left_out = std::mem::take(&mut self.left_out);
+        self.left = self.a_second;
+        (left_out > 0).then_some(left_out)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_storm_is_counted() {
+        let mut budget = Budget::new(2);
+        assert_eq!([(); 5].map(|()| budget.take()), [true, true, false, false, false]);
+        assert_eq!(budget.renew(), Some(3));
+        assert_eq!([(); 2].map(|()| budget.take()), [true, true]);
+        assert_eq!(budget.renew(), None);
+    }
+}

@@ -46,15 +46,19 @@
 //! plc's keys; [`rail`] joining and creating the
 //! rail; [`port`] publishers and subscribers; [`inbox`] wake-ups; [`reactor`] waiting for descriptors and
 //! clocks; [`context`] what `run` receives; [`image_write`] and [`scan_record`] the two binary codecs;
-//! [`event`] what happened; [`units`] and [`net`] values of the stack file. With the feature `testing` a module of that
-//! name makes a rail for tests.
+//! for field services [`inputs`] publishes, [`outputs`] says when outputs follow the image, [`can_queue`] holds frames
+//! that wait for a driver, [`turns`] is the loop; [`event`] what happened; [`units`] and [`net`] values of the stack file. With the
+//! feature `testing` a module of that name makes a rail for tests.
 
+pub mod can_queue;
 pub mod clock;
 pub mod context;
 pub mod event;
 pub mod image_write;
 pub mod inbox;
+pub mod inputs;
 pub mod net;
+pub mod outputs;
 pub mod payload;
 pub mod plc_table;
 pub mod port;
@@ -65,6 +69,7 @@ pub mod stack;
 #[cfg(feature = "testing")]
 pub mod testing;
 pub mod topic;
+pub mod turns;
 pub mod units;
 pub mod wiring;
 

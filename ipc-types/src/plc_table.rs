@@ -37,8 +37,8 @@ pub fn areas(table: &Value) -> AreaSizes {
 /// never more than twice the 100 ms after which every plc repeats its image.
 pub fn shortest_stale_after(table: &Value) -> Span {
     let span = |key, default_ms| value::<Span>(table, key).unwrap_or(Span::from_ms(default_ms));
-    let on_inputs = table.get("trigger").is_some_and(|trigger| trigger == "inputs");
-    let period = if on_inputs { span("max_interval", 100) } else { span("cycle", 10) };
+    let on_news = table.get("trigger").is_some_and(|trigger| trigger == "inputs" || trigger.is_object());
+    let period = if on_news { span("max_interval", 100) } else { span("cycle", 10) };
     Span(period.ns().saturating_mul(3)).min(Span::from_ms(2 * REPEAT_MS))
 }
 
@@ -92,6 +92,8 @@ mod tests {
             (json!({ "cycle": "1ms", "max_interval": "20ms" }), "3ms"),
             (json!({ "trigger": "inputs" }), "200ms"),
             (json!({ "trigger": "inputs", "max_interval": "20ms" }), "60ms"),
+            (json!({ "trigger": { "service": "io", "event": "sync" } }), "200ms"),
+            (json!({ "trigger": { "service": "io", "event": "sync" }, "max_interval": "20ms" }), "60ms"),
         ] {
             assert_eq!(shortest_stale_after(&table).to_string(), shortest, "{table}");
         }

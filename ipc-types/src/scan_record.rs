@@ -63,6 +63,7 @@ pub mod tag {
     pub const FRAMES: u8 = 8;
     /// Reserved for results of jobs that the program asked for.
     pub const RESULTS: u8 = 9;
+    pub const TRIGGER: u8 = 10;
     pub const SETUP: u8 = 16;
     pub const MEMORY: u8 = 17;
     pub const FIELD: u8 = 18;
@@ -269,11 +270,25 @@ pub struct Fault<'a> {
     pub text: &'a str,
 }
 
+/// The tasks without INTERVAL and SINGLE are due in this scan: the event came that the stack file names as trigger,
+/// or it has not come for too long.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Trigger {
+    /// Message that told of it; without event: the last one of the service.
+    pub source: Source,
+    /// Number of the event since the start of that service.
+    pub count: u64,
+    /// Events before it, since the last scan that was triggered, that no scan was triggered by.
+    pub missed: u64,
+    /// No event: `max_interval` is over.
+    pub overdue: bool,
+}
+
 /// Where a task stands in its schedule.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct TaskState {
     pub task: u16,
-    /// PLC time from which it is due.
+    /// PLC time from which it is due; of a task that waits for an event: the largest number.
     pub next_ns: i64,
     /// Last value of its SINGLE.
     pub single: bool,

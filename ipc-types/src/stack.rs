@@ -112,6 +112,28 @@ impl Stack {
     pub fn topic(&self, name: &str) -> Option<&TopicEntry> {
         self.topics.iter().find(|t| t.name == name)
     }
+    /// The plc service whose image a service of this wiring exchanges. A name that leads nowhere is found by the
+    /// launcher, who sees it in the wiring.
+    pub fn plc_of(&self, wiring: &Wiring) -> Option<&ServiceEntry> {
+        self.service(wiring.plc.as_deref()?).filter(|plc| plc.kind == "plc")
+    }
+    /// What is wrong with leaving out the key that names a service of this kind: then the stack must have exactly one.
+    pub fn check_only(&self, me: &str, key: &str, kind: &str) -> Option<Finding> {
+        let names: Vec<&str> =
+            self.services.iter().filter(|s| s.kind == kind).map(|s| s.name.as_str()).collect();
+        let (message, help) = match names.as_slice() {
+            [_] => return None,
+            [] => (
+                format!("the stack has no service of kind \"{kind}\""),
+                format!("add one, as [[service]] with kind = \"{kind}\""),
+            ),
+            [first, ..] => (
+                format!("the stack has several services of kind \"{kind}\": {}", names.join(", ")),
+                format!("say which one: {key} = \"{first}\""),
+            ),
+        };
+        Some(Finding::error(me, key, message, help))
+    }
     /// Name of the service with this writer number, for messages.
     pub fn writer_name(&self, writer: u32) -> String {
         match self.services.iter().find(|s| s.index == writer) {
@@ -119,5 +141,65 @@ impl Stack {
             None if writer == 0 => "launcher".to_owned(),
             None => format!("pid {}", writer & 0x7FFF_FFFF),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn stack(kinds: &[(&str, &str)]) -> Stack {
+        let entry = |&(name, kind): &(&str, &str)| ServiceEntry {
+            name: name.to_owned(),
+            kind: kind.to_owned(),
+            index: 1,
+            config: serde_json::Value::Null,
+            wiring: Wiring::default(),
+        };
+        Stack {
+            name: "s".to_owned(),
+            file: PathBuf::new(),
+            dir: PathBuf::new(),
+            text: String::new(),
+            build_id: String::new(),
+            root: PathBuf::new(),
+            prefix: String::new(),
+            services: kinds.iter().map(entry).collect(),
+            topics: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn a_key_may_be_left_out_where_the_stack_has_one_such_service() {
+        let said = |kinds: &[(&str, &str)]| {
+            stack(kinds)
+                .check_only("io", "bus", "can")
+                .map(|f| format!("{}: {} -> {}", f.key, f.message, f.help))
+        };
+        assert_eq!(said(&[("io", "can-io"), ("can0", "can")]), None);
+        assert_eq!(
+            said(&[("io", "can-io")]).as_deref(),
+            Some(
+                "bus: the stack has no service of kind \"can\" -> add one, as [[service]] with kind = \"can\""
+            )
+        );
+        assert_eq!(
+            said(&[("can0", "can"), ("can1", "can")]).as_deref(),
+            Some(
+                "bus: the stack has several services of kind \"can\": can0, can1 -> say which one: bus = \"can0\""
+            )
+        );
+    }
+
+    #[test]
+    fn the_plc_of_a_wiring_is_one() {
+        let stack = stack(&[("plc", "plc"), ("io", "can-io")]);
+        let plc = |name: &str| {
+            let wiring = Wiring { plc: Some(name.to_owned()), ..Wiring::default() };
+            stack.plc_of(&wiring).map(|s| s.name.clone())
+        };
+        assert_eq!(plc("plc").as_deref(), Some("plc"));
+        assert_eq!((plc("io"), plc("nobody")), (None, None));
+        assert!(stack.plc_of(&Wiring::default()).is_none());
     }
 }

@@ -34,6 +34,21 @@ pub fn service(name: &str, kind: &str, config: serde_json::Value, wiring: Wiring
     ServiceEntry { name: name.to_owned(), kind: kind.to_owned(), index: 0, config, wiring }
 }
 
+/// A stack of these services that is nowhere: for what services declare and check.
+pub fn stack(services: Vec<ServiceEntry>) -> Stack {
+    Stack {
+        name: "test".into(),
+        file: "stack.toml".into(),
+        dir: ".".into(),
+        text: String::new(),
+        build_id: String::new(),
+        root: "/nonexistent".into(),
+        prefix: "x".into(),
+        services,
+        topics: Vec::new(),
+    }
+}
+
 /// A topic with the table's limits and a few ports; of a kind that belongs to no service, `service` may be empty.
 pub fn topic(kind: TopicKind, service: &str) -> TopicEntry {
     let (max_publishers, max_subscribers) = rail::port_limits(kind, 3, 3);

@@ -152,6 +152,23 @@ pub struct Listener {
     pub key: String,
 }
 
+/// An event of a service that a plc task can be triggered by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ServiceEvent {
+    /// The inputs of one SYNC were published as one sample.
+    Sync,
+}
+
+impl ServiceEvent {
+    /// As the stack file writes it.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Sync => "sync",
+        }
+    }
+}
+
 /// Everything a service declares.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Wiring {
@@ -177,6 +194,10 @@ pub struct Wiring {
     /// Reads every recorded topic of the stack (the recorder).
     #[serde(default)]
     pub records: bool,
+    /// Events of the service that may trigger the implicit task of its plc; it counts them in
+    /// [`crate::payload::Inputs::samples`].
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub events: Vec<ServiceEvent>,
 }
 
 impl Wiring {

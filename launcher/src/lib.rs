@@ -20,5 +20,6 @@ use std::process::ExitCode;
 
 /// The executable: reads the command line and does what it says.
 pub fn main() -> ExitCode {
+    supervise::sys::give_large_memory_back();
     commands::run(cli::Cli::parse())
 }

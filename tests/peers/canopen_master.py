@@ -1,7 +1,8 @@
 """python-canopen as master of a network. Usage: canopen_master.py INTERFACE PORT EDS PART...
 
-INTERFACE is cannelloni or slcan, a server on 127.0.0.1. Every part prints its name when it is through; one that needs
-somebody else prints what it waits for. See the functions `part_*` below."""
+INTERFACE is cannelloni or slcan, a server on 127.0.0.1 at PORT, or socketcan with the network interface PORT. Every
+part prints its name when it is through; one that needs somebody else prints what it waits for. See the functions
+`part_*` below."""
 
 import random
 import struct
@@ -10,6 +11,7 @@ import time
 
 import can
 import canopen
+from bus import where
 
 SIMULATED = 2
 DEVICE = 5
@@ -23,7 +25,7 @@ def say(text):
 def bus(interface, port):
     if interface == "slcan":
         return {"interface": "slcan", "channel": f"socket://127.0.0.1:{port}", "sleep_after_open": 0.1}
-    return {"interface": "cannelloni", "channel": f"127.0.0.1:{port}"}
+    return where(port)
 
 
 class Network:
@@ -222,6 +224,7 @@ def part_pdo(network):
         until("TPDO", lambda: transmit.data == bytes([value, value ^ 0xFF]))
         assert node.sdo[0x6200][1].raw == value
     remapped(network, node)
+    every_type(network, node)
     synchronous(network, node)
     timed(network, node)
     wrong_length(network, node)
@@ -263,6 +266,27 @@ def sync(network, node, times):
     for _ in range(times):
         network.net.sync.transmit()
         node.sdo[0x1000].raw
+
+
+def every_type(network, node):
+    """What a receive PDO brought works at the next SYNC with types 0 to 240, at once with 254 and 255; the others are
+    refused. A transmit PDO of type 254 is sent by the event of the manufacturer, here every change."""
+    receive, transmit = node.rpdo[1], node.tpdo[1]
+    for number in (0, 1, 7, 240, 254, 255):
+        kind(node, receive, number)
+        kind(node, transmit, 254 if number == 254 else 255)
+        before = node.sdo[0x6200][1].raw
+        value = before ^ 0xFF
+        receive[0].raw = value
+        receive.transmit()
+        after = node.sdo[0x6200][1].raw
+        assert after == (value if number > 240 else before), f"type {number}: {before:#x} {value:#x} {after:#x}"
+        network.net.sync.transmit()
+        until(f"the value of type {number}", lambda: node.sdo[0x6200][1].raw == value)
+        until(f"the TPDO after type {number}", lambda: transmit.data[:1] == bytes([value]))
+    for index, reserved in ((0x1400, (241, 251, 252, 253)), (0x1800, (241, 251))):
+        for number in reserved:
+            aborts(0x06090030, lambda: node.sdo.download(index, 2, bytes([number])))
 
 
 def synchronous(network, node):
@@ -395,6 +419,31 @@ def guarding(network, node):
     reset(network, node)
 
 
+def silent(node):
+    try:
+        node.nmt.wait_for_heartbeat(0.5)
+    except canopen.nmt.NmtError:
+        return True
+    return False
+
+
+def part_loss(network):
+    """A device that dies sends no heartbeat any more; when it is back it tells by its boot-up message."""
+    node = fresh(network)
+    node.sdo[0x1017].raw = 50
+    node.nmt.state = "OPERATIONAL"
+    heartbeat_state(network, node, "OPERATIONAL")
+    say("kill it")
+    until("silence", lambda: silent(node))
+    network.forget()
+    say("start it")
+    until("the boot-up message", lambda: [bytes(f.data) for f in network.seen(0x700 + SIMULATED)] == [b"\0"])
+    assert node.sdo[0x1017].raw == 0, "its configuration is the default again"
+    node.sdo[0x1017].raw = 50
+    heartbeat_state(network, node, "PRE-OPERATIONAL")
+    reset(network, node)
+
+
 def part_device(network):
     """A program of the PLC is the device: its inputs are the outputs of the network and back; EMCY when it stops."""
     node = network.node(DEVICE)
@@ -453,6 +502,7 @@ def part_fastscan(network):
             continue
         assert address[:3] == [0, 0x401, 0x10000], address
         found.append(address[3])
+        tries = 0
         assert lss.inquire_node_id() == 255
         assert lss.inquire_lss_address(0x5D) == address[3]
         lss.configure_node_id(19 + len(found))
@@ -463,8 +513,8 @@ def part_fastscan(network):
         node = network.node(20 + i)
         assert node.sdo[0x1018][4].raw == serial
         node.nmt.state = "OPERATIONAL"
-    # Selective switch and inquiry of one that has a node-id; a new node-id takes effect at its reset. A device on a
-    # bus of this kind has no bit timing to set, and no file to store anything.
+    # Selective switch and inquiry of one that has a node-id; a new node-id takes effect at its reset. A device
+    # takes no other bit timing than that of its bus, and has no file to store anything.
     lss.RESPONSE_TIMEOUT = 2
     assert lss.send_switch_state_selective(0, 0x401, 0x10000, 3)
     third = 20 + found.index(3)
@@ -485,7 +535,7 @@ def part_fastscan(network):
 
 def main():
     interface, port, eds = sys.argv[1:4]
-    network = Network(interface, int(port), eds)
+    network = Network(interface, port, eds)
     for name in sys.argv[4:]:
         globals()[f"part_{name}"](network)
         say(name)

@@ -1,12 +1,15 @@
-"""A device made of durand. Usage: durand_slave.py PORT NODE-ID SERIAL, or durand_slave.py eds
+"""A device made of durand. Usage: durand_slave.py BUS NODE-ID SERIAL..., or durand_slave.py eds
 
-With `eds` it prints the electronic data sheet that durand makes of the device. Its inputs show its outputs; 2000h is a
-memory of any length, 2001h a number. A node-id of 255 waits for LSS. Commands on stdin: `emcy`, `emcy gone`."""
+BUS is a port of a cannelloni server on 127.0.0.1, or a network interface. With `eds` it prints the electronic data
+sheet that durand makes of the device. Its inputs show its outputs; 2000h is a memory of any length, 2001h a number. A
+node-id of 255 waits for LSS; then there may be several, each with a serial number. Commands on stdin: `emcy`,
+`emcy gone`, to the last of them."""
 
 import sys
 import threading
 
 import can
+from bus import where
 from durand import CANBusNetwork, MinimalNode, Record, Variable
 from durand import DatatypeEnum as DT
 from durand.network import NetworkABC
@@ -59,12 +62,13 @@ def main():
     if sys.argv[1] == "eds":
         print(device(Nowhere(), 1, 1).eds.content)
         return
-    port, node_id, serial = (int(text) for text in sys.argv[1:4])
+    node_id, *serials = (int(text) for text in sys.argv[2:])
     scheduler = SyncScheduler()
     set_scheduler(scheduler)
     threading.Thread(target=scheduler.run, daemon=True).start()
-    network = CANBusNetwork(can.Bus(interface="cannelloni", channel=f"127.0.0.1:{port}"))
-    node = device(network, node_id, serial)
+    # A network of durand has one subscriber for an identifier.
+    nodes = [device(CANBusNetwork(can.Bus(**where(sys.argv[1]))), node_id, serial) for serial in serials]
+    node = nodes[-1]
     print("ready", flush=True)
     for line in sys.stdin:
         if line.strip() == "emcy":

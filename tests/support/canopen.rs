@@ -3,7 +3,7 @@
 use super::Stack;
 use serde_json::Value;
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Stdio};
 
 /// The EDS of the simulated CiA 401 device.
@@ -29,6 +29,44 @@ pub fn slave(name: &str, id: u8, more: &str) -> String {
         "\n[[service]]\nname = \"{name}\"\nkind = \"canopen-slave\"\nnode_id = {id}\nsimulate = \"401\"\n{more}\n"
     )
 }
+
+/// A simulated node, and a device whose inside is a program.
+pub const DEVICES: &str = r#"
+[[service]]
+name = "simulated"
+kind = "canopen-slave"
+node_id = 2
+simulate = "401"
+serial_number = 7
+restart = { max = 0, within = "10s", on_exhausted = "hold" }
+
+[[service]]
+name = "device"
+kind = "canopen-slave"
+node_id = 5
+eds = "io401.eds"
+store = "device.store"
+map = [
+    { object = "6200:01", to = "%IB0", symbol = "Lamps" },
+    { object = "6411:01", to = "%IW2", symbol = "Valve" },
+    { object = "6000:01", from = "%QB0", symbol = "Buttons" },
+    { object = "6401:01", from = "%QW2", symbol = "Level" },
+]
+
+[[service]]
+name = "plc"
+kind = "plc"
+program = ["main.st"]
+cycle = "5ms"
+"#;
+
+/// The inside.
+pub const DEVICE_PROGRAM: &str = r"
+PROGRAM Device
+  Buttons := Lamps;
+  Level := Valve + 1;
+END_PROGRAM
+";
 
 /// `dinrail canopen status --json`.
 pub fn status(stack: &Stack) -> Option<Value> {
@@ -75,6 +113,67 @@ pub fn object(stack: &Stack, node: u8, object: &str) -> Option<String> {
     let output = stack.cli(&["canopen", "sdo", "read", &node.to_string(), object]);
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
     output.status.success().then(|| text.trim().rsplit("= ").next().unwrap_or_default().to_owned())
+}
+
+/// Value of a place of the image, once it is the expected one.
+pub fn becomes(stack: &Stack, place: &str, expected: i64) {
+    let expected = format!("{place} = {expected}");
+    stack.wait(&expected, || {
+        let said = stack.cli(&["plc", "read", place]).stdout;
+        (String::from_utf8_lossy(&said).trim() == expected).then_some(())
+    });
+}
+
+/// Whatever is written to outputs comes back at inputs, over the bus and through the foreign device.
+pub fn exchanges(stack: &Stack, pairs: &[(&str, &str)]) {
+    for value in [17i64, 85] {
+        for (i, (output, _)) in pairs.iter().enumerate() {
+            stack.ok(&["plc", "write", &format!("{output}={}", value + i as i64)]);
+        }
+        for (i, (_, input)) in pairs.iter().enumerate() {
+            becomes(stack, input, value + i as i64);
+        }
+    }
+}
+
+pub fn log_has(stack: &Stack, text: &str) {
+    stack.wait(&format!("'{text}' in the log"), || stack.log().contains(text).then_some(()));
+}
+
+/// Bytes that repeat nowhere, so that a lost or doubled segment shows.
+pub fn long_value(bytes: usize) -> Vec<u8> {
+    let mut state = 0x1234_5678_9ABC_DEF1u64;
+    let mut out = Vec::with_capacity(bytes + 8);
+    while out.len() < bytes {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        out.extend_from_slice(&state.to_le_bytes());
+    }
+    out.truncate(bytes);
+    out
+}
+
+/// Writes and reads a long value by the command line.
+pub fn there_and_back(stack: &Stack, node: &str, bytes: usize, mode: &str) {
+    let value = long_value(bytes);
+    let file = stack.scratch.write("value.bin", &value);
+    let back = stack.scratch.0.join("back.bin");
+    stack.ok(&["canopen", "sdo", "write", node, "2000", "--input", path(&file), "--mode", mode]);
+    stack.ok(&["canopen", "sdo", "read", node, "2000", "--output", path(&back), "--mode", mode]);
+    assert_eq!(fs::read(&back).unwrap().len(), bytes);
+    assert!(fs::read(&back).unwrap() == value, "{bytes} bytes to node {node}, {mode}");
+}
+
+pub fn path(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// Text of a command that must fail.
+pub fn refused(stack: &Stack, args: &[&str]) -> String {
+    let output = stack.cli(args);
+    assert!(!output.status.success(), "{args:?} succeeded");
+    String::from_utf8(output.stderr).unwrap()
 }
 
 /// Error control messages of the bus, boot-up messages among them, from now on.

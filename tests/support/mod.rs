@@ -1,13 +1,16 @@
 //! What the cross-process tests share: a stack of one's own, foreign programs, waiting for conditions.
 #![allow(dead_code, clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+pub mod c_peer;
 pub mod canopen;
 pub mod car;
 pub mod modbus;
 pub mod pcap;
 pub mod peers;
 pub mod python;
+pub mod rtu_line;
 pub mod socketcand;
+pub mod uml;
 
 pub use python::skip;
 use serde_json::Value;
@@ -269,6 +272,23 @@ impl Stack {
     pub fn recordings(&self) -> Vec<PathBuf> {
         recordings_in(&self.scratch.0.join("recordings"))
     }
+}
+
+/// Events of all recordings of a stack.
+pub fn recorded_events(stack: &Stack) -> Vec<Value> {
+    let mut all = Vec::new();
+    for recording in stack.recordings() {
+        let output = dinrail()
+            .args(["recordings", "cat", "--topic", "stack/events", "--json"])
+            .arg(&recording)
+            .output()
+            .unwrap();
+        for line in String::from_utf8_lossy(&output.stdout).lines() {
+            let value: Value = serde_json::from_str(line).unwrap();
+            all.push(value.get("body").cloned().unwrap_or(value));
+        }
+    }
+    all
 }
 
 pub fn recordings_in(dir: &Path) -> Vec<PathBuf> {

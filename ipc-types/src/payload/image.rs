@@ -12,9 +12,12 @@ payload! {
     ///
     /// Tail: the bytes of each of the service's input ranges (`ServiceEntry::wiring.inputs`) in order, then one
     /// [`Quality`] byte a range.
-    pub struct Inputs: "dinrail.Inputs/1", tail, Ros1 {
+    pub struct Inputs: "dinrail.Inputs/2", tail, Ros1 {
         /// CLOCK_MONOTONIC in ns of the newest field data in it.
         pub data_t_ns: u64,
+        /// Samples that this service has published at the end of SYNC windows since its start: one more with each
+        /// SYNC whose sample was published. 0: none yet, or not a service with SYNC.
+        pub samples: u64,
         /// Number of ranges, so many quality bytes end the tail.
         pub ranges: u32,
         /// Bytes of the tail.
@@ -80,7 +83,7 @@ payload! {
     /// The whole process image after a scan, on `<plc>/image`. Not recorded (the scan record holds it).
     ///
     /// Tail: %I, %Q, %M, whole, in this order.
-    pub struct Image: "dinrail.Image/1", tail, Ros1 {
+    pub struct Image: "dinrail.Image/2", tail, Ros1 {
         /// Number of the scan, from 1; 0 before the first.
         pub scan: u64,
         /// PLC time of the scan in ns.
@@ -89,6 +92,9 @@ payload! {
         pub utc_ns: i64,
         /// `Artifact::hash` of the running program; 0 without program.
         pub program_hash: u64,
+        /// CLOCK_MONOTONIC in ns just before the newest scan that ran a task (without program: that moved routes)
+        /// took its inputs: what was published before has reached the program. 0: none since the start of the service.
+        pub inputs_t_ns: u64,
         /// Highest write taken of each writer: `seq`.
         pub ack_seq: [u64; MAX_ACKS],
         /// ... writer, 0 = free entry (writer 0 is the launcher, which writes no image).

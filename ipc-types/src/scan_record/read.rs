@@ -34,6 +34,8 @@ pub enum Section<'a> {
         task: u16,
         periods: u64,
     },
+    /// The tasks that wait for an event are due.
+    Trigger(Trigger),
     Fault(Fault<'a>),
     Changes(Changes<'a>),
     Setup(&'a [u8]),
@@ -203,6 +205,12 @@ fn decode(tag: u8, a: u8, b: u16, body: &[u8]) -> Option<Section<'_>> {
             Section::Forces(body.chunks_exact(PATCH_BYTES).map(patch).collect::<Option<_>>()?)
         }
         tag::SKIPPED => Section::Skipped { task: b, periods: u64_at(body, 0)? },
+        tag::TRIGGER => Section::Trigger(Trigger {
+            source: source(body)?,
+            count: u64_at(body, SOURCE_BYTES)?,
+            missed: u64_at(body, SOURCE_BYTES + 8)?,
+            overdue: a != 0,
+        }),
         tag::FAULT => Section::Fault(Fault {
             task: a,
             trap: u32_at(body, 0)?,

@@ -16,6 +16,7 @@ fn example(writer: &mut Writer, input: &[u8], op: &[u8]) -> Vec<u8> {
     writer.input_end(at);
     writer.write(&source, 4, op);
     writer.forces(&[patch(300, 2, [1; 8])]);
+    writer.trigger(&Trigger { source, count: 41, missed: 2, overdue: false });
     writer.skipped(1, 9);
     writer.fault(&Fault { task: 1, trap: 2, statement: 5, instance: 640, value: 10, real: 0.5, text: "x" });
     let at = writer.changes_begin();
@@ -53,6 +54,11 @@ fn what_was_written_is_read_in_the_same_order() {
                 assert_eq!(table.len(), 1);
                 "forces"
             }
+            Section::Trigger(trigger) => {
+                let source = Source { writer: 3, generation: 2, seq: 77 };
+                assert_eq!(trigger, Trigger { source, count: 41, missed: 2, overdue: false });
+                "trigger"
+            }
             Section::Skipped { task: 1, periods: 9 } => "skipped",
             Section::Fault(fault) => {
                 assert_eq!((fault.trap, fault.value, fault.text), (2, 10, "x"));
@@ -65,7 +71,10 @@ fn what_was_written_is_read_in_the_same_order() {
             other => panic!("{other:?}"),
         });
     }
-    assert_eq!(names, ["start", "force", "input", "write", "forces", "skipped", "fault", "changes"]);
+    assert_eq!(
+        names,
+        ["start", "force", "input", "write", "forces", "trigger", "skipped", "fault", "changes"]
+    );
 }
 
 #[test]

@@ -138,6 +138,16 @@ impl Writer {
         self.section(tag::SKIPPED, 0, task, &[&periods.to_le_bytes()]);
     }
 
+    /// The tasks that wait for an event are due.
+    pub fn trigger(&mut self, trigger: &Trigger) {
+        self.section(
+            tag::TRIGGER,
+            u8::from(trigger.overdue),
+            0,
+            &[&encode_source(&trigger.source), &trigger.count.to_le_bytes(), &trigger.missed.to_le_bytes()],
+        );
+    }
+
     pub fn fault(&mut self, fault: &Fault<'_>) {
         self.section(
             tag::FAULT,

@@ -13,6 +13,7 @@ mod map;
 pub mod modbus;
 mod new;
 mod plc;
+mod plc_write;
 mod ps;
 pub mod recordings;
 mod replay;

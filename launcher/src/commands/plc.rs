@@ -1,5 +1,6 @@
 //! `dinrail plc`: jobs for a PLC of a running stack.
 
+use super::plc_write::{check_all, write};
 use super::{UsageError, println};
 use crate::cli::PlcCommand;
 use crate::supervise::client::{find, observe};
@@ -18,6 +19,12 @@ pub fn run(
     json: bool,
 ) -> anyhow::Result<()> {
     let mut jobs = jobs_of(&command)?;
+    let assignments = match &command {
+        PlcCommand::Write { assignments } | PlcCommand::Force { assignments } => {
+            assignments.iter().map(|text| assignment(text)).collect::<Result<Vec<_>, _>>()?
+        }
+        _ => Vec::new(),
+    };
     let running = find(stack)?;
     let mut ctx = observe(&running)?;
     for job in &mut jobs {
@@ -25,6 +32,14 @@ pub fn run(
     }
     let plc = choose(&ctx, "plc", service)?;
     let mut line = JobLine::open(&mut ctx, running, "plc", &plc)?;
+    let is_write = matches!(command, PlcCommand::Write { .. });
+    if !assignments.is_empty() {
+        let what = if is_write { "written" } else { "forced" };
+        let known = check_all(&ctx.stack, &mut line, &plc, &assignments, what)?;
+        if is_write {
+            return write(&mut ctx, &mut line, &plc, &assignments, known, json);
+        }
+    }
     for job in jobs {
         let answer = line.ask(&job, LIMIT)?;
         if json {
@@ -58,7 +73,8 @@ fn jobs_of(command: &PlcCommand) -> Result<Vec<Value>, UsageError> {
             vec![json!({ "do": "load", "path": path, "cold": cold })]
         }
         PlcCommand::Force { assignments } => assign("force", assignments)?,
-        PlcCommand::Write { assignments } => assign("write", assignments)?,
+        // Not as jobs: see `plc_write`.
+        PlcCommand::Write { .. } => Vec::new(),
         PlcCommand::Unforce { all: true, .. } => plain("unforce_all"),
         PlcCommand::Unforce { variables, .. } => each("unforce", variables),
         PlcCommand::Read { variables } => each("read", variables),

@@ -17,7 +17,9 @@ const STATUS_WAIT: Duration = Duration::from_millis(1500);
 /// Time between two screens of `--watch`.
 const WATCH: Duration = Duration::from_secs(1);
 /// Columns of a table within a status.
-const COLUMNS_MAX: usize = 12;
+const COLUMNS_MAX: usize = 16;
+/// Columns that name what a row is about, first those that name most.
+const NAMING: [&str; 8] = ["target", "serial", "service", "address", "unit", "node", "id", "name"];
 /// Rows of it.
 const ROWS_MAX: usize = 64;
 
@@ -210,8 +212,45 @@ fn body_text(body: &Value) -> String {
         .collect();
     for (path, value) in &fields {
         if let Some(rows) = rows_of(value) {
-            text += &format!("  {path}\n{}", list_text(&rows));
+            text += &tables_text(path, rows, 0);
         }
+    }
+    text
+}
+
+type Row<'a> = Vec<(String, &'a Value)>;
+
+/// A list of objects as a table; lists of objects in its rows (units of lines) as tables of their own below it, whose
+/// first column says to which row they belong.
+fn tables_text(path: &str, mut rows: Vec<Row<'_>>, depth: u32) -> String {
+    let mut inner: Vec<(String, Vec<Row<'_>>)> = Vec::new();
+    for row in &mut rows {
+        // The depth is bounded by the status's own limit of bytes; this keeps the stack small anyhow.
+        let plain = row.iter().filter(|(_, value)| rows_of(value).is_none());
+        let whose = plain.min_by_key(|(path, _)| rank(path)).filter(|_| depth < 8).cloned();
+        let Some((key, owner)) = whose else { continue };
+        row.retain(|(name, value)| {
+            let Some(list) = rows_of(value) else { return true };
+            let list = list.into_iter().map(|mut entry| {
+                let taken = entry.iter().any(|(name, _)| *name == key);
+                let key = if taken { format!("{path}.{key}") } else { key.clone() };
+                entry.insert(0, (key, owner));
+                entry
+            });
+            match inner.iter_mut().find(|(known, _)| known == name) {
+                Some((_, entries)) => entries.extend(list),
+                None => inner.push((name.clone(), list.collect())),
+            }
+            false
+        });
+    }
+    // An empty list beside full ones is no column either.
+    for row in &mut rows {
+        row.retain(|(name, _)| inner.iter().all(|(list, _)| list != name));
+    }
+    let mut text = format!("  {path}\n{}", list_text(&rows, depth > 0));
+    for (name, entries) in inner {
+        text += &tables_text(&format!("{path}.{name}"), entries, depth + 1);
     }
     text
 }
@@ -236,25 +275,41 @@ pub fn flat(value: &Value) -> Vec<(String, &Value)> {
 }
 
 /// The rows of a list of objects; `None` for anything else.
-fn rows_of(value: &Value) -> Option<Vec<Vec<(String, &Value)>>> {
+fn rows_of(value: &Value) -> Option<Vec<Row<'_>>> {
     let list = value.as_array().filter(|l| !l.is_empty())?;
     list.iter().all(Value::is_object).then(|| list.iter().map(flat).collect())
 }
 
-fn list_text(rows: &[Vec<(String, &Value)>]) -> String {
+/// Columns that say what a row is about stand first, those of objects within it last.
+fn rank(path: &str) -> usize {
+    let known = NAMING.iter().position(|name| *name == path);
+    known.unwrap_or(NAMING.len() + usize::from(path.contains('.')))
+}
+
+fn list_text(rows: &[Row<'_>], owned: bool) -> String {
     let mut head: Vec<&str> = Vec::new();
     for (path, _) in rows.iter().flatten() {
-        if !head.contains(&path.as_str()) && head.len() < COLUMNS_MAX {
+        if !head.contains(&path.as_str()) {
             head.push(path);
         }
     }
-    let cells = |row: &Vec<(String, &Value)>| {
+    // The owner that was put in front of the rows of an inner list stays there.
+    head[usize::from(owned)..].sort_by_key(|path| rank(path));
+    head.truncate(COLUMNS_MAX);
+    let cells = |row: &Row<'_>| {
         let find =
             |name: &&str| row.iter().find(|(path, _)| path == name).map_or("-".to_owned(), |(_, v)| plain(v));
         head.iter().map(find).collect::<Vec<String>>()
     };
     let body: Vec<Vec<String>> = rows.iter().take(ROWS_MAX).map(cells).collect();
-    let mut text: String = table(&head, &body).lines().map(|line| format!("    {line}\n")).collect();
+    // `counters.requests` is `requests` where no other column has that name.
+    let short = |path: &str| path.rsplit('.').next().unwrap_or_default().to_owned();
+    let shorts: Vec<String> = head.iter().map(|path| short(path)).collect();
+    let named = head.iter().zip(&shorts).map(|(path, short)| {
+        if shorts.iter().filter(|other| *other == short).count() == 1 { short.as_str() } else { path }
+    });
+    let named: Vec<&str> = named.collect();
+    let mut text: String = table(&named, &body).lines().map(|line| format!("    {line}\n")).collect();
     if rows.len() > ROWS_MAX {
         text += &format!("    and {} more\n", rows.len() - ROWS_MAX);
     }
@@ -322,6 +377,42 @@ mod tests {
         // In the order of the stack, whatever the order asked.
         assert_eq!(choose(&has, &["modbus".to_owned(), "rec".to_owned()]).unwrap(), ["rec", "modbus"]);
         assert_eq!(choose(&has, &[]).unwrap().len(), 3);
+    }
+
+    #[test]
+    fn lists_within_lists_are_tables_of_their_own() {
+        let unit = |unit: u8, requests: u64| json!({ "unit": unit, "state": "ok", "counters": { "requests": requests }, "rtt_us": null });
+        let body = json!({
+            "clients": 1,
+            "lines": [
+                { "serial": "com1", "waiting": 0, "counters": { "late": 1 }, "units": [unit(1, 20), unit(17, 3)] },
+                { "serial": "com2", "waiting": 2, "counters": { "late": 0 }, "units": [unit(5, 7)] },
+                { "serial": "com3", "waiting": 0, "counters": { "late": 0 }, "units": [] },
+            ],
+        });
+        insta::assert_snapshot!(body_text(&body), @r"
+          clients  1
+          lines
+            serial  waiting  late
+            com1    0        1
+            com2    2        0
+            com3    0        0
+          lines.units
+            serial  unit  rtt_us  state  requests
+            com1    1     -       ok     20
+            com1    17    -       ok     3
+            com2    5     -       ok     7
+        ");
+        // Names that would be the same stay whole, and an owner is told from what it owns.
+        let body = json!({ "a": [{ "id": 1, "x": { "n": 2 }, "y": { "n": 3 }, "b": [{ "id": 9 }] }] });
+        insta::assert_snapshot!(body_text(&body), @r"
+          a
+            id  x.n  y.n
+            1   2    3
+          a.b
+            a.id  id
+            1     9
+        ");
     }
 
     #[test]

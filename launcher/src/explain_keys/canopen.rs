@@ -182,6 +182,12 @@ pub const CANOPEN_MASTER: &[KeyDoc] = &[
         "none",
         "%IB that shows the quality: 0 good, 1 stale, 2 no data, 3 dead.",
     ),
+    may(
+        "node[].map[].queue",
+        Int(1, 64),
+        "the newest value counts",
+        "Every received value of the PDO reaches one scan, in order; so many wait, then the oldest of them is dropped. The same for all objects of a PDO.",
+    ),
     with(
         "node[].on_error",
         Choice(&["zero", "ignore", "stop"]),

@@ -23,7 +23,7 @@ pub const CAN: &[KeyDoc] = &[
         "number",
         Int(0, u32::MAX as i64),
         "the order in the stack file",
-        "Number of the bus for blocks that name a bus by number.",
+        "Number of the bus for blocks that name a bus by number. There is no such block yet: nothing uses the number.",
     ),
     with("bitrate", BitRate, "\"500k\"", "Nominal bit rate, 5k to 1M."),
     with("data_bitrate", BitRate, "\"2M\"", "Bit rate of the data phase of CAN FD, from `bitrate` up to 8M."),

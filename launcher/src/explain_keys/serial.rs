@@ -9,13 +9,13 @@ pub const SERIAL: &[KeyDoc] = &[
     need(
         "device",
         Text,
-        "The port: \"/dev/ttyUSB0\" (better its name in /dev/serial/by-id, which stays), \"socket://host:port\" for a port that ser2net or the like serves as raw TCP, \"pty:/path\" for a pseudo-terminal with a link to it. A service named com1 makes it COM1 for the rest of the stack.",
+        "The port: \"/dev/ttyUSB0\" (better its name in /dev/serial/by-id, which stays), \"socket://host:port\" for a port that ser2net or the like serves as raw TCP, \"pty:/path\" for a pseudo-terminal with a link to it (\"pty:com1\": in the folder of the stack file). The path of a device is whole, from \"/\". A service named com1 makes it COM1 for the rest of the stack.",
     ),
     may(
         "number",
         Int(0, u32::MAX as i64),
         "the order in the stack file",
-        "Number of the port for blocks that name a port by number.",
+        "Number of the port for blocks that name a port by number. There is no such block yet: the number is shown in the status, and nothing else uses it.",
     ),
     with(
         "framing",

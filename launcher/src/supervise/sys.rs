@@ -1,4 +1,5 @@
-//! What the operating system offers only through raw calls: the scheduler and inherited descriptors.
+//! What the operating system offers only through raw calls: the scheduler, inherited descriptors, and the allocator's
+//! thresholds.
 //!
 //! The only module of the launcher with `unsafe`.
 #![allow(unsafe_code)]
@@ -36,6 +37,18 @@ pub fn take_inherited(number: RawFd) -> io::Result<OwnedFd> {
     }
     // SAFETY: open (checked above), and by the contract above nobody else in this process owns it.
     Ok(unsafe { OwnedFd::from_raw_fd(number) })
+}
+
+/// Keeps large buffers out of the heap. glibc would take them from it as soon as the first one was freed, and the pages
+/// that such buffers touched at ever new places stay with the process: a recorder grew by 35 KiB a file. To be called
+/// before anything large is freed.
+pub fn give_large_memory_back() {
+    #[cfg(target_env = "gnu")]
+    // SAFETY: mallopt takes two numbers and touches the allocator's own settings only.
+    unsafe {
+        // Fixed where glibc begins: allocations from here on come from the system whole and go back to it whole.
+        libc::mallopt(libc::M_MMAP_THRESHOLD, 128 * 1024);
+    }
 }
 
 /// Lets no descriptor that the launcher's starter left open reach a service. Since Linux 5.11; older ones pass them

@@ -1,7 +1,10 @@
 //! The service's table of the stack file.
 
+use ipc_types::outputs::{self, STALE_AFTER, StopWord};
 use ipc_types::units::Span;
 use serde::{Deserialize, Deserializer, Serialize, de};
+
+pub use ipc_types::outputs::SafeOn;
 
 use crate::protocol::signal::ByteOrder;
 use crate::protocol::value::IecType;
@@ -38,18 +41,6 @@ pub struct Config {
     /// Frames sent.
     #[serde(default, rename = "out")]
     pub outputs: Vec<Output>,
-}
-
-/// States of the plc in which outputs go to their safe state.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum SafeOn {
-    /// Stopped by command.
-    Stop,
-    /// The program faulted.
-    Fault,
-    /// Halted at a breakpoint.
-    Halted,
 }
 
 /// An identifier: a number, or hex text such as `"0x123"` or `"18FEF100"`. Eight digits mean 29 bits.
@@ -240,51 +231,18 @@ pub struct OutputSignal {
     pub symbol: Option<String>,
 }
 
-/// Safe state of a frame: `"silent"`, `"hold"`, `"not_available"` or `{ values = [...] }`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-#[serde(untagged)]
-pub enum OnStop {
-    /// One of the words.
-    Word(OnStopWord),
-    /// Values of the signals, in their order and unit.
-    Values(StopValues),
-}
+/// Safe state of a frame: a word, or values of the signals, in their order and unit.
+pub type OnStop = outputs::OnStop<OnStopWord, f64>;
 
-impl<'de> Deserialize<'de> for OnStop {
-    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
-        struct Visit;
-        impl<'de> de::Visitor<'de> for Visit {
-            type Value = OnStop;
-            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-                f.write_str("\"silent\", \"hold\", \"not_available\" or { values = [...] }")
-            }
-            fn visit_str<E: de::Error>(self, text: &str) -> Result<OnStop, E> {
-                OnStopWord::deserialize(de::value::StrDeserializer::<E>::new(text))
-                    .map(OnStop::Word)
-                    .map_err(|_| E::invalid_value(de::Unexpected::Str(text), &self))
-            }
-            // A derived untagged enum would swallow which key of the table is unknown.
-            fn visit_map<A: de::MapAccess<'de>>(self, map: A) -> Result<OnStop, A::Error> {
-                StopValues::deserialize(de::value::MapAccessDeserializer::new(map)).map(OnStop::Values)
-            }
-        }
-        d.deserialize_any(Visit)
-    }
-}
-
-/// The table form of [`OnStop`].
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct StopValues {
-    /// One number per signal.
-    pub values: Vec<f64>,
-}
+/// The table form of [`OnStop`]: one number per signal.
+pub type StopValues = outputs::StopValues<f64>;
 
 /// Words of [`OnStop`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OnStopWord {
     /// Nothing is sent: the receiver's own timeout fires.
+    #[default]
     Silent,
     /// Cyclic frames go on with the last values.
     Hold,
@@ -292,10 +250,8 @@ pub enum OnStopWord {
     NotAvailable,
 }
 
-impl Default for OnStop {
-    fn default() -> Self {
-        Self::Word(OnStopWord::Silent)
-    }
+impl StopWord for OnStopWord {
+    const EXPECTED: &'static str = "\"silent\", \"hold\", \"not_available\" or { values = [...] }";
 }
 
 fn one() -> f64 {
@@ -305,10 +261,10 @@ fn zero_span() -> Span {
     Span(0)
 }
 fn default_stale_after() -> Span {
-    Span::from_ms(200)
+    STALE_AFTER
 }
 fn default_safe_on() -> Vec<SafeOn> {
-    vec![SafeOn::Stop, SafeOn::Fault, SafeOn::Halted]
+    SafeOn::ALL.to_vec()
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@
 
 use dinrail_iec::LocatedAddress;
 use dinrail_iec::artifact::AreaKind;
+use ipc_types::outputs::copy_value;
 
 use crate::plan::{OutputFrame, Safe};
 
@@ -184,15 +185,9 @@ impl Slot {
 
 /// The value at an address as little-endian bytes; a bit as 0 or 1.
 fn read(area: &[u8], address: LocatedAddress) -> Option<[u8; 8]> {
-    let first = address.byte as usize;
     let mut value = [0u8; 8];
-    if let Some(bit) = address.bit {
-        value[0] = (area.get(first)? >> bit) & 1;
-        return Some(value);
-    }
-    let bytes = address.size.bytes() as usize;
-    value.get_mut(..bytes)?.copy_from_slice(area.get(first..first + bytes)?);
-    Some(value)
+    let place = value.get_mut(..address.size.bytes() as usize)?;
+    copy_value(area, address.byte, address.bit, place).then_some(value)
 }
 
 #[cfg(test)]

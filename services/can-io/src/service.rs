@@ -2,34 +2,28 @@
 
 use dinrail_iec::artifact::AreaKind;
 use dinrail_iec::{Addressing, LocatedAddress};
-use ipc_types::event::{EventKind, Level};
-use ipc_types::inbox::Inbox;
+use ipc_types::event::{Budget, EventKind, Level};
+use ipc_types::inputs::InputsPort;
+use ipc_types::outputs::{Change, Guard, OutputImage, Unsafe, Words};
 use ipc_types::payload::{
-    CanFrame, Image, Inputs, PlcState, Quality, can_flag,
+    CanFrame, Inputs, Quality, can_flag,
     id_flag::{EFF, ERR, RTR},
 };
 use ipc_types::port::{Publisher, ReadCounters, SendError, Subscriber};
 use ipc_types::rail::RailError;
-use ipc_types::reactor::{Reactor, Wake};
 use ipc_types::stack::ServiceEntry;
 use ipc_types::topic::TopicKind;
+use ipc_types::turns::Turns;
 use ipc_types::wiring::{Area, ImageRange, Neighbours, OnBad, TopicDecl};
 use ipc_types::{Context, Finding, Stack, Wiring, clock, plc_table};
 use serde::Serialize;
-use std::time::Duration;
 use thiserror::Error;
 
-use crate::config::{Config, OnBadValue, OnBadWord, SafeOn};
+use crate::config::{Config, OnBadValue, OnBadWord};
 use crate::inputs::{InputCounters, InputTable, RowStatus};
 use crate::outputs::{OutputCounters, OutputTable};
 use crate::plan::{Plan, id_text, plan};
 
-/// Heartbeat; the launcher wants one every 100 ms.
-const BEAT: Duration = Duration::from_millis(50);
-/// Beats from one status to the next: one second.
-const STATUS_BEATS: u32 = 20;
-/// The inputs are repeated at least this often, so that a plc that comes late gets them.
-const REPEAT_NS: u64 = 90_000_000;
 /// Frames taken from the bus before other work has its turn.
 const TAKE_FRAMES: usize = 256;
 /// Quality events a second that go to the rail.
@@ -97,7 +91,7 @@ fn addressing_named(name: &str) -> Addressing {
 
 /// The plc service whose image is exchanged, and how its addresses count.
 fn plc_of<'a>(stack: &'a Stack, wiring: &Wiring) -> (Option<&'a ServiceEntry>, Addressing) {
-    let plc = wiring.plc.as_deref().and_then(|plc| stack.service(plc)).filter(|plc| plc.kind == "plc");
+    let plc = stack.plc_of(wiring);
     let addressing = plc.map(|plc| addressing_named(plc_table::addressing(&plc.config)));
     (plc, addressing.unwrap_or_default())
 }
@@ -148,75 +142,12 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
         found.push(Finding::warning(name, "", "the service has neither in nor out: it does nothing", help));
         return found;
     }
-    // A named bus or plc that leads nowhere is found by the launcher, who sees it in the wiring.
+    // A named bus that leads nowhere is found by the launcher, who sees it in the wiring.
     if config.bus.is_none() {
-        found.extend(no_only_bus(stack, name));
+        found.extend(stack.check_only(name, "bus", "can"));
     }
     found.extend(plc.and_then(|plc| plc_table::check_stale_after(name, config.stale_after, plc)));
     found
-}
-
-/// Without the key `bus` the stack must have one bus.
-fn no_only_bus(stack: &Stack, me: &str) -> Option<Finding> {
-    let buses: Vec<&str> =
-        stack.services.iter().filter(|s| s.kind == "can").map(|s| s.name.as_str()).collect();
-    let (message, help) = match buses.as_slice() {
-        [_] => return None,
-        [] => (
-            "the stack has no service of kind \"can\"".to_owned(),
-            "add one, as [[service]] with kind = \"can\"".to_owned(),
-        ),
-        [first, ..] => (
-            format!("the stack has several services of kind \"can\": {}", buses.join(", ")),
-            format!("say which one: bus = \"{first}\""),
-        ),
-    };
-    Some(Finding::error(me, "bus", message, help))
-}
-
-/// Why outputs are in their safe state.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-enum Unsafe {
-    /// No image of a running program yet.
-    Waiting,
-    Stale,
-    Stop,
-    Fault,
-    Halted,
-}
-
-impl Unsafe {
-    /// A stop is somebody's will, by `dinrail plc stop` or with the whole stack, and no fault.
-    fn level(self) -> Level {
-        match self {
-            Self::Stop => Level::Info,
-            Self::Waiting | Self::Stale | Self::Fault | Self::Halted => Level::Fault,
-        }
-    }
-
-    fn text(self) -> &'static str {
-        match self {
-            Self::Waiting => "the PLC has not finished a scan yet",
-            Self::Stale => "the image of the PLC is stale: it is dead, hung or too slow",
-            Self::Stop => "the PLC is stopped",
-            Self::Fault => "the program of the PLC faulted",
-            Self::Halted => "the PLC is halted at a breakpoint",
-        }
-    }
-}
-
-/// What an image asks of the outputs; `None`: follow it.
-fn judge(state: PlcState, scan: u64, safe_on: &[SafeOn]) -> Option<Unsafe> {
-    let asked = |on, why| safe_on.contains(&on).then_some(why);
-    match state {
-        _ if scan == 0 => Some(Unsafe::Waiting),
-        PlcState::Starting => Some(Unsafe::Waiting),
-        PlcState::Run => None,
-        PlcState::Stop => asked(SafeOn::Stop, Unsafe::Stop),
-        PlcState::Fault => asked(SafeOn::Fault, Unsafe::Fault),
-        PlcState::Halted => asked(SafeOn::Halted, Unsafe::Halted),
-    }
 }
 
 #[derive(Serialize)]
@@ -236,16 +167,10 @@ struct Service {
     inputs: InputTable,
     outputs: OutputTable,
     rx: Option<Subscriber<CanFrame>>,
-    image: Option<Subscriber<Image>>,
+    image: OutputImage,
     tx: Option<Publisher<CanFrame>>,
-    published: Option<Publisher<Inputs>>,
-    published_ns: u64,
-    image_ns: u64,
-    safe: Option<Unsafe>,
-    /// The last `safe_entered` has no `safe_left` yet.
-    safe_told: bool,
-    event_budget: u32,
-    events_left_out: u32,
+    published: InputsPort,
+    events: Budget,
 }
 
 /// Runs until the launcher says stop.
@@ -264,92 +189,51 @@ pub fn run(mut ctx: Context) -> Result<(), RunError> {
     let image = read("/image").map(|topic| ctx.subscriber(&topic)).transpose()?;
     let tx = wiring.writes.first().map(|(topic, _)| ctx.publisher(topic)).transpose()?;
     let published = if inputs.is_empty() { None } else { Some(ctx.publisher(&TopicKind::Inputs.of(&name))?) };
-    let mut inbox = ctx.inbox()?;
-    let mut reactor = Reactor::new()?;
-    let wakes = Wakes {
-        inbox: reactor.add(inbox.fd())?,
-        stop: reactor.add(ctx.shutdown_fd())?,
-        beat: reactor.add_timer(BEAT)?,
-        alarm: reactor.add_alarm()?,
-    };
+    let turns = Turns::new(ctx.inbox()?, ctx.shutdown_fd())?;
     let mut service = Service {
         inputs: InputTable::new(&inputs),
         outputs: OutputTable::new(&outputs),
+        rx,
+        image: OutputImage::new(image, Guard::new(config.stale_after, &config.safe_on)),
+        tx,
+        published: InputsPort::new(published),
+        events: Budget::new(QUALITY_EVENTS),
         ctx,
         config,
-        rx,
-        image,
-        tx,
-        published,
-        published_ns: 0,
-        image_ns: 0,
-        safe: Some(Unsafe::Waiting),
-        safe_told: false,
-        event_budget: QUALITY_EVENTS,
-        events_left_out: 0,
     };
     // Tells the plc that its inputs have no data yet, so that its first scan need not wait.
     service.publish(true);
     service.status();
     service.ctx.ready();
-    service.work(&mut reactor, &mut inbox, &wakes)
-}
-
-struct Wakes {
-    inbox: Wake,
-    stop: Wake,
-    beat: Wake,
-    alarm: Wake,
+    service.work(turns)
 }
 
 impl Service {
-    fn work(&mut self, reactor: &mut Reactor, inbox: &mut Inbox, wakes: &Wakes) -> Result<(), RunError> {
-        let mut beats = 0u32;
-        let mut alarm_ns = None;
+    fn work(&mut self, mut turns: Turns) -> Result<(), RunError> {
         loop {
-            let (mut rang, mut beat) = (false, false);
-            for &wake in reactor.wait(None)? {
-                rang |= wake == wakes.inbox;
-                beat |= wake == wakes.beat;
-                if wake == wakes.alarm {
-                    alarm_ns = None;
-                }
-                if wake == wakes.stop {
-                    return Ok(());
-                }
+            let due = turns.wait()?;
+            if due.stop {
+                return Ok(());
             }
-            if rang {
-                inbox.drain();
-            }
-            // Also without a ring: what was left of the last turn, and what a lost ring would leave.
+            turns.drain();
             let more = self.take_frames();
             self.take_image();
             let now_ns = clock::mono_ns();
-            self.watch(now_ns);
+            let change = self.image.on_time(now_ns);
+            self.follow(change);
             let next_ns = self.send_due(now_ns);
-            if beat {
-                beats += 1;
+            if due.beat {
                 self.ctx.beat();
-                if now_ns.saturating_sub(self.published_ns) >= REPEAT_NS {
+                if self.published.is_due(now_ns) {
                     self.publish(false);
                 }
-                if beats.is_multiple_of(STATUS_BEATS) {
-                    self.status();
-                }
             }
-            let stale_ns =
-                (self.safe.is_none()).then(|| self.image_ns.saturating_add(self.config.stale_after.ns()));
-            let next_ns = if more {
-                Some(now_ns)
-            } else {
-                next_ns.into_iter().chain(self.inputs.next_check_ns()).chain(stale_ns).min()
-            };
-            if let Some(next_ns) = next_ns
-                && alarm_ns != Some(next_ns)
-            {
-                reactor.set_alarm(wakes.alarm, next_ns)?;
-                alarm_ns = Some(next_ns);
+            if due.status {
+                self.status();
             }
+            let checked_ns = self.inputs.next_check_ns();
+            let next_ns = next_ns.into_iter().chain(checked_ns).chain(self.image.next_deadline()).min();
+            turns.come_again(if more { Some(now_ns) } else { next_ns })?;
         }
     }
 
@@ -374,25 +258,16 @@ impl Service {
 
     /// `fresh`: news, so the plc is woken; otherwise a repetition.
     fn publish(&mut self, fresh: bool) {
-        let Some(port) = &mut self.published else { return };
         let header =
             Inputs { data_t_ns: self.inputs.data_t_ns(), ranges: self.inputs.ranges(), ..Inputs::default() };
-        if let Err(e) = port.send_tail(header, self.inputs.tail()) {
-            tracing::warn!("inputs: {e}");
-        }
-        if fresh {
-            port.ring();
-        }
-        self.published_ns = clock::mono_ns();
+        self.published.publish(header, self.inputs.tail(), fresh);
     }
 
     fn report_quality(&mut self) {
         for change in self.inputs.drain_changes() {
-            if self.event_budget == 0 {
-                self.events_left_out += 1;
+            if !self.events.take() {
                 continue;
             }
-            self.event_budget -= 1;
             let input = &self.config.inputs[change.index];
             let what = input.symbol.as_ref().unwrap_or(&input.to);
             let id = id_text(change.can_id);
@@ -407,65 +282,18 @@ impl Service {
     }
 
     fn take_image(&mut self) {
-        let Some(port) = &mut self.image else { return };
-        let (outputs, safe_on) = (&mut self.outputs, &self.config.safe_on);
-        let mut verdict = None;
-        let mut image_ns = self.image_ns;
-        port.newest(|image, tail| {
-            let Some((_, q, m)) = image.areas(tail) else { return };
-            image_ns = image.stamp.t_ns;
-            let why = judge(image.plc_state(), image.scan, safe_on);
-            let fresh = clock::mono_ns().saturating_sub(image_ns) <= self.config.stale_after.ns();
-            // One that waited too long in the queue is as good as none.
-            let why = why.or((!fresh).then_some(Unsafe::Stale));
-            if why.is_none() {
-                outputs.image(q, m, clock::mono_ns());
-            }
-            verdict = Some(why);
-        });
-        self.image_ns = image_ns;
-        if let Some(why) = verdict {
-            self.set_safe(why);
-        }
+        let outputs = &mut self.outputs;
+        let change = self.image.take(|q, m| outputs.image(q, m, clock::mono_ns()));
+        self.follow(change);
     }
 
-    /// Notices an image that stopped coming.
-    fn watch(&mut self, now_ns: u64) {
-        if self.safe.is_none() && now_ns.saturating_sub(self.image_ns) > self.config.stale_after.ns() {
-            self.set_safe(Some(Unsafe::Stale));
+    /// The outputs enter or leave their safe state.
+    fn follow(&mut self, change: Option<Change>) {
+        let Some(change) = change else { return };
+        if change.why.is_some() {
+            self.outputs.safe(clock::mono_ns());
         }
-    }
-
-    fn set_safe(&mut self, why: Option<Unsafe>) {
-        if self.safe == why {
-            return;
-        }
-        self.safe = why;
-        if self.image.is_none() {
-            return;
-        }
-        match why {
-            Some(why) => {
-                let was_running = self.outputs.is_running();
-                self.outputs.safe(clock::mono_ns());
-                if was_running {
-                    self.safe_told = true;
-                    let message = format!("outputs went to their safe state: {}", why.text());
-                    self.ctx.event(
-                        EventKind::SafeEntered,
-                        why.level(),
-                        message,
-                        serde_json::json!({ "why": why }),
-                    );
-                }
-            }
-            None if self.safe_told => {
-                self.safe_told = false;
-                let message = "outputs follow the image again";
-                self.ctx.event(EventKind::SafeLeft, Level::Info, message, serde_json::Value::Null);
-            }
-            None => {}
-        }
+        change.tell(&mut self.ctx, &Words::OUTPUTS);
     }
 
     /// Sends what is due; returns when something is due next.
@@ -504,18 +332,16 @@ impl Service {
     }
 
     fn status(&mut self) {
-        if self.events_left_out > 0 {
-            let message =
-                format!("{} more quality changes in the last second left out", self.events_left_out);
+        if let Some(left_out) = self.events.renew() {
+            let message = format!("{left_out} more quality changes in the last second left out");
             self.ctx.event(EventKind::InputQuality, Level::Warning, message, serde_json::Value::Null);
         }
-        (self.event_budget, self.events_left_out) = (QUALITY_EVENTS, 0);
         let frames = self.inputs.rows(STATUS_ROWS);
         let status = Status {
             inputs: self.inputs.counters(),
             frames: &frames,
             outputs: self.outputs.counters(),
-            safe: self.safe.filter(|_| self.image.is_some()),
+            safe: self.image.why(),
             rx: self.rx.as_ref().map(Subscriber::counters),
         };
         self.ctx.status(&status);

@@ -1,6 +1,7 @@
 //! Tests of what the service declares and checks. The running service is tested in `tests/`.
 
 use super::*;
+use ipc_types::testing;
 use serde_json::{Value, json};
 
 fn config(value: Value) -> Config {
@@ -8,21 +9,7 @@ fn config(value: Value) -> Config {
 }
 
 fn entry(name: &str, kind: &str, config: Value) -> ServiceEntry {
-    ServiceEntry { name: name.into(), kind: kind.into(), index: 1, config, wiring: Wiring::default() }
-}
-
-fn stack(services: Vec<ServiceEntry>) -> Stack {
-    Stack {
-        name: "test".into(),
-        file: "stack.toml".into(),
-        dir: ".".into(),
-        text: String::new(),
-        build_id: String::new(),
-        root: "/nonexistent".into(),
-        prefix: "x".into(),
-        services,
-        topics: vec![],
-    }
+    testing::service(name, kind, config, Wiring::default())
 }
 
 fn demo() -> Value {
@@ -82,7 +69,7 @@ fn findings() {
     let said = |value: Value, services: Vec<ServiceEntry>| {
         let mut me = entry("io", "can-io", Value::Null);
         me.wiring.plc = services.iter().find(|s| s.kind == "plc").map(|s| s.name.clone());
-        let found = check(&config(value), &stack(services), &me);
+        let found = check(&config(value), &testing::stack(services), &me);
         found.iter().map(|f| format!("{}: {} -> {}", f.key, f.message, f.help)).collect::<Vec<_>>().join("\n")
     };
     let can = || entry("can0", "can", json!({}));
@@ -116,20 +103,4 @@ fn findings() {
         stale_after: stale_after = 150ms is shorter than 3 times the longest time between two scans of 'plc' -> leave it out (200ms) or set at least "200ms"
         stale_after: stale_after = 10us is shorter than 3 times the longest time between two scans of 'plc' -> leave it out (200ms) or set at least "30ms"
         "#);
-}
-
-#[test]
-fn verdicts() {
-    let all = [SafeOn::Stop, SafeOn::Fault, SafeOn::Halted];
-    assert_eq!(judge(PlcState::Run, 1, &all), None);
-    assert_eq!(judge(PlcState::Run, 0, &all), Some(Unsafe::Waiting));
-    assert_eq!(judge(PlcState::Starting, 5, &[]), Some(Unsafe::Waiting));
-    assert_eq!(judge(PlcState::Stop, 5, &all), Some(Unsafe::Stop));
-    assert_eq!(judge(PlcState::Fault, 5, &all), Some(Unsafe::Fault));
-    assert_eq!(judge(PlcState::Halted, 5, &all), Some(Unsafe::Halted));
-    assert_eq!(judge(PlcState::Halted, 5, &[SafeOn::Stop]), None);
-    assert_eq!(Unsafe::Stop.level(), Level::Info);
-    for fault in [Unsafe::Waiting, Unsafe::Stale, Unsafe::Fault, Unsafe::Halted] {
-        assert_eq!(fault.level(), Level::Fault, "{fault:?}");
-    }
 }

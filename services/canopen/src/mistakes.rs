@@ -1,5 +1,7 @@
 //! Mistakes of a stack file, as `check` and a refused start name them.
 
+use ipc_types::Finding;
+
 /// Something wrong in the service's table.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Mistake {
@@ -10,6 +12,14 @@ pub struct Mistake {
     pub help: String,
     /// The stack runs all the same.
     pub warning: bool,
+}
+
+impl Mistake {
+    /// As `check` tells it of a service.
+    pub fn finding(&self, service: &str) -> Finding {
+        let make = if self.warning { Finding::warning } else { Finding::error };
+        make(service, &self.key, &self.message, &self.help)
+    }
 }
 
 /// Mistakes so far.

@@ -23,6 +23,7 @@ pub mod line;
 pub mod line_state;
 pub mod map;
 pub mod map_config;
+pub mod process;
 pub mod process_image;
 pub mod protocol;
 mod readable;

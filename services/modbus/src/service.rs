@@ -14,7 +14,6 @@ use dinrail_iec::Addressing;
 use ipc_types::plc_table;
 use ipc_types::rail::RailError;
 use ipc_types::stack::ServiceEntry;
-use std::io;
 
 pub use check::check;
 pub use live::run;
@@ -42,8 +41,8 @@ pub enum ServiceError {
     Config { service: String, text: String },
     #[error("service '{service}': no plc service is named; set plc = \"NAME\"")]
     NoPlc { service: String },
-    #[error("service '{service}': {what} failed: {source}")]
-    System { service: String, what: &'static str, source: io::Error },
+    #[error("service '{service}': {source}")]
+    Run { service: String, source: crate::process::RunError },
 }
 
 /// A name that is none is the plc service's mistake, and found there.

@@ -4,21 +4,82 @@ use crate::routes::RouteConfig;
 use crate::setup::{ModByZeroName, RealToIntName};
 use dinrail_iec::Addressing;
 use ipc_types::units::{Size, Span};
-use serde::{Deserialize, Serialize};
+use ipc_types::wiring::ServiceEvent;
+use serde::{Deserialize, Deserializer, Serialize, de};
 use std::path::PathBuf;
 
 /// Base cycle when neither `cycle` nor a TASK says one.
 pub const DEFAULT_CYCLE: Span = Span::from_ms(10);
 
-/// What starts a scan.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+/// What starts a scan: `"cycle"`, `"inputs"`, or `{ service = "io", event = "sync" }`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[serde(untagged)]
 pub enum Trigger {
+    Word(TriggerWord),
+    /// An event of one service, and the clock every `max_interval`.
+    Event(EventTrigger),
+}
+
+/// Words of [`Trigger`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TriggerWord {
     /// The clock.
-    #[default]
     Cycle,
     /// A new sample of an input service, and the clock every `max_interval`.
     Inputs,
+}
+
+/// The table form of [`Trigger`].
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EventTrigger {
+    /// Name of the service.
+    pub service: String,
+    pub event: ServiceEvent,
+}
+
+impl Trigger {
+    /// The clock.
+    pub const CYCLE: Self = Self::Word(TriggerWord::Cycle);
+    /// Every sample of every input service.
+    pub const INPUTS: Self = Self::Word(TriggerWord::Inputs);
+
+    /// The event, if it is one.
+    pub fn event(&self) -> Option<&EventTrigger> {
+        match self {
+            Self::Event(event) => Some(event),
+            Self::Word(_) => None,
+        }
+    }
+}
+
+impl Default for Trigger {
+    fn default() -> Self {
+        Self::CYCLE
+    }
+}
+
+impl<'de> Deserialize<'de> for Trigger {
+    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
+        struct Visit;
+        impl<'de> de::Visitor<'de> for Visit {
+            type Value = Trigger;
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("\"cycle\", \"inputs\" or { service = \"io\", event = \"sync\" }")
+            }
+            fn visit_str<E: de::Error>(self, text: &str) -> Result<Trigger, E> {
+                TriggerWord::deserialize(de::value::StrDeserializer::<E>::new(text))
+                    .map(Trigger::Word)
+                    .map_err(|_| E::invalid_value(de::Unexpected::Str(text), &self))
+            }
+            // A derived untagged enum would swallow which key of the table is unknown.
+            fn visit_map<A: de::MapAccess<'de>>(self, map: A) -> Result<Trigger, A::Error> {
+                EventTrigger::deserialize(de::value::MapAccessDeserializer::new(map)).map(Trigger::Event)
+            }
+        }
+        d.deserialize_any(Visit)
+    }
 }
 
 /// What follows a program fault.
@@ -43,9 +104,9 @@ pub struct Config {
     /// Period of the one implicit task. Not together with a TASK of the program.
     pub cycle: Option<Span>,
     pub trigger: Trigger,
-    /// `trigger = "inputs"`: shortest time between two scans.
+    /// With a `trigger` other than the clock: shortest time between two scans.
     pub min_interval: Span,
-    /// `trigger = "inputs"`: longest time between two scans.
+    /// Longest time between two scans; with a `trigger` other than the clock, between two runs of the implicit task.
     pub max_interval: Span,
     pub input_bytes: Size,
     pub output_bytes: Size,
@@ -72,7 +133,7 @@ impl Default for Config {
         Self {
             program: Vec::new(),
             cycle: None,
-            trigger: Trigger::Cycle,
+            trigger: Trigger::default(),
             min_interval: Span(500_000),
             max_interval: Span::from_ms(100),
             input_bytes: Size(4096),

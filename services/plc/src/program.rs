@@ -87,6 +87,7 @@ pub fn setup(config: &Config, stack: &Stack, me: &str) -> Setup {
         output_bytes: Config::area_bytes(config.output_bytes),
         marker_bytes: Config::area_bytes(config.marker_bytes),
         routes: config.route.clone(),
+        trigger: config.trigger.event().cloned(),
         cycle_ns: config.cycle.map(|c| c.ns()),
         debug: config.debug,
         real_to_int: config.real_to_int,

@@ -8,6 +8,8 @@ mod jobs;
 mod live;
 mod load;
 mod status;
+mod trigger;
+mod watch;
 
 use crate::config::{Config, OnFault, Trigger};
 use crate::engine::{Engine, EngineError, Runtime, RuntimeError};
@@ -76,6 +78,7 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
     ] {
         check_size(key, size, &me.name, &mut findings);
     }
+    trigger::check(config, stack, &me.name, &mut findings);
     let setup = program::setup(config, stack, &me.name);
     check_neighbours(config, stack, &me.name, &setup, &mut findings);
     if config.route.len() > MAX_ROUTES {
@@ -92,8 +95,8 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
 fn check_times(config: &Config, me: &str, findings: &mut Vec<Finding>) {
     let mut error =
         |key: &str, message: String, help: &str| findings.push(Finding::error(me, key, message, help));
-    if config.trigger == Trigger::Inputs && config.cycle.is_some() {
-        let message = "cycle and trigger = \"inputs\" exclude each other".to_owned();
+    if config.trigger != Trigger::CYCLE && config.cycle.is_some() {
+        let message = format!("cycle and trigger = {} exclude each other", trigger::text(&config.trigger));
         error("cycle", message, "leave cycle out; max_interval says how long a scan may fail to come");
     }
     if let Some(cycle) = config.cycle.filter(|c| *c < MIN_CYCLE || c.ns() > 3_600_000_000_000) {
@@ -185,6 +188,7 @@ fn check_program(config: &Config, stack: &Stack, me: &str, setup: &Setup, findin
                 ));
             }
             let map = &compiled.program.artifact.map;
+            trigger::check_tasks(config, &map.tasks, me, findings);
             for access in map.writes.iter().filter(|a| a.area == AreaKind::Input) {
                 let message = format!("{} assigns %IB{}", map.place_text(access.statement), access.byte);
                 let help = "inputs belong to the field: the value is overwritten at the next scan";

@@ -1,5 +1,6 @@
 //! How an engine is set up beside its program. Stands in every keyframe, so that a recording verifies alone.
 
+use crate::config::EventTrigger;
 use crate::engine::value::Image;
 use crate::routes::{Route, RouteConfig, RouteError, RoutePlan};
 use dinrail_iec::artifact::Area;
@@ -49,6 +50,9 @@ pub struct Setup {
     pub inputs: Vec<InputRange>,
     #[serde(default)]
     pub routes: Vec<RouteConfig>,
+    /// Tasks without INTERVAL and SINGLE wait for this event; without it they run in every scan.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trigger: Option<EventTrigger>,
     // What the program was compiled with, so that a changed one can be compiled likewise.
     #[serde(default)]
     pub cycle_ns: Option<u64>,
@@ -92,6 +96,7 @@ impl Default for Setup {
             marker_bytes: 4096,
             inputs: Vec::new(),
             routes: Vec::new(),
+            trigger: None,
             cycle_ns: None,
             externals: Vec::new(),
             debug: false,

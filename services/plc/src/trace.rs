@@ -8,7 +8,7 @@ use crate::program::{ProgramError, compile_sources};
 use crate::setup::Setup;
 use dinrail_iec::Source as SourceText;
 use dinrail_iec::artifact::{ElemType, Symbol};
-use ipc_types::scan_record::{Command, Source, Start};
+use ipc_types::scan_record::{Command, Source, Start, Trigger};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use std::sync::Arc;
@@ -178,6 +178,9 @@ impl Tracer {
         }
         for (path, patch) in patches {
             self.engine.control(&source, &Command::Set { patch, path });
+        }
+        if self.engine.setup().trigger.is_some() {
+            self.engine.trigger(&Trigger { source, count: scan, ..Trigger::default() });
         }
         self.engine.finish();
         Ok(())

@@ -469,6 +469,7 @@ pub fn replay(engine: &mut Engine, content: &Content<'_>) -> ScanOutcome {
                 };
                 engine.write(&source, judged, tail);
             }
+            Section::Trigger(trigger) => engine.trigger(&trigger),
             Section::Fault(fault) if fault.trap == TrapId::Watchdog as u32 => killed = Some(fault),
             _ => {}
         }

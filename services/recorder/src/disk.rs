@@ -11,13 +11,14 @@ pub const ENDING: &str = ".mcap";
 /// Ending of the copy that sealing writes before it takes the file's place.
 pub const SEALING: &str = ".mcap.sealing";
 
-/// `<stack>-<UTC yyyymmddThhmmss.mmm>-<n>.mcap`.
-pub fn file_name(stack: &str, utc_ns: i64, n: u32) -> String {
+/// `<stack>-<UTC yyyymmddThhmmss.mmm>-<n>.mcap`. `n` counts all files of the stack in the folder: a machine that starts
+/// with a wrong clock names its files by it, and the newest must not be taken for the oldest.
+pub fn file_name(stack: &str, utc_ns: i64, n: u64) -> String {
     format!("{stack}-{}-{n}{ENDING}", Utc::from_ns(utc_ns).compact())
 }
 
 /// Time and number of a name that [`file_name`] made for this stack.
-fn parse_name<'a>(stack: &str, name: &'a str, ending: &str) -> Option<(&'a str, u32)> {
+fn parse_name<'a>(stack: &str, name: &'a str, ending: &str) -> Option<(&'a str, u64)> {
     let rest = name.strip_prefix(stack)?.strip_prefix('-')?.strip_suffix(ending)?;
     let (time, n) = rest.split_once('-')?;
     let shape = time.bytes().enumerate().all(|(i, c)| match i {
@@ -45,7 +46,7 @@ fn listed(dir: &Path, stack: &str, ending: &str) -> Vec<Found> {
         };
         let Ok(meta) = item.metadata() else { continue };
         if meta.is_file() {
-            found.push(((time.to_owned(), n), Found { path: item.path(), bytes: meta.len() }));
+            found.push(((n, time.to_owned()), Found { path: item.path(), bytes: meta.len() }));
         }
     }
     found.sort_by(|a, b| a.0.cmp(&b.0));
@@ -55,6 +56,13 @@ fn listed(dir: &Path, stack: &str, ending: &str) -> Vec<Found> {
 /// This stack's recordings in the folder, oldest first.
 pub fn recordings(dir: &Path, stack: &str) -> Vec<Found> {
     listed(dir, stack, ENDING)
+}
+
+/// Number of this stack's newest recording in the folder, 0 when there is none.
+pub fn last_number(dir: &Path, stack: &str) -> u64 {
+    let newest = recordings(dir, stack).pop();
+    let name = newest.as_ref().and_then(|f| f.path.file_name()?.to_str());
+    name.and_then(|name| parse_name(stack, name, ENDING)).map_or(0, |(_, n)| n)
 }
 
 /// Every `.mcap` file of the folder, of any stack and making, by name.
@@ -80,9 +88,9 @@ pub fn remove_half_sealed(dir: &Path, stack: &str) {
 }
 
 /// Creates the next file. Never overwrites: counts `n` up over what is there.
-pub fn create(dir: &Path, stack: &str, utc_ns: i64, n: &mut u32) -> io::Result<(PathBuf, File)> {
+pub fn create(dir: &Path, stack: &str, utc_ns: i64, n: &mut u64) -> io::Result<(PathBuf, File)> {
     for _ in 0..1000 {
-        *n += 1;
+        *n = n.saturating_add(1);
         let path = dir.join(file_name(stack, utc_ns, *n));
         match OpenOptions::new().read(true).write(true).create_new(true).open(&path) {
             Ok(file) => {
@@ -117,18 +125,23 @@ pub fn is_finished(path: &Path) -> bool {
     ends(path).unwrap_or(false)
 }
 
-/// Deletes the oldest finished files of this stack until all together take at most `keep` bytes. The current
-/// file, unfinished files and files in use stay. Returns what was deleted.
+/// Deletes files of this stack until all together take at most `keep` bytes: the oldest finished ones, and when those
+/// are not enough, the oldest unfinished ones, which could not be made whole. The current file and files in use stay.
+/// Returns what was deleted.
 pub fn enforce_quota(dir: &Path, stack: &str, keep: u64, current: Option<&Path>) -> Vec<Found> {
-    let all = recordings(dir, stack);
+    let mut all = recordings(dir, stack);
     let mut total: u64 = all.iter().map(|f| f.bytes).sum();
     let mut deleted = Vec::new();
+    if total <= keep {
+        return deleted;
+    }
+    all.sort_by_cached_key(|f| !is_finished(&f.path));
     for found in all {
         if total <= keep {
             break;
         }
         let in_use = || !File::open(&found.path).is_ok_and(|file| lock(&file));
-        if Some(found.path.as_path()) == current || !is_finished(&found.path) || in_use() {
+        if Some(found.path.as_path()) == current || in_use() {
             continue;
         }
         if std::fs::remove_file(&found.path).is_ok() {
@@ -214,7 +227,10 @@ mod tests {
     #[test]
     fn the_oldest_finished_file_goes_first() {
         let dir = TempDir::new("quota");
-        let names: Vec<_> = (1..=12).map(|n| file_name("s", i64::from(n) * 1_000_000_000, n)).collect();
+        // The clock goes wrong after the sixth: the number says which is the newest.
+        let second = |n: u64| if n > 6 { n as i64 - 100 } else { n as i64 };
+        let names: Vec<_> = (1..=12).map(|n| file_name("s", second(n) * 1_000_000_000, n)).collect();
+        assert_eq!(last_number(dir.path(), "s"), 0);
         for (i, name) in names.iter().enumerate() {
             file(dir.path(), name, 1000, i != 1);
         }
@@ -228,10 +244,15 @@ mod tests {
         assert_eq!(gone, [&names[0], &names[3], &names[4]]);
         assert!(stranger.exists());
         assert_eq!(all_recordings(dir.path()).unwrap().len(), 12 + 1 - 3);
+        assert_eq!(last_number(dir.path(), "s"), 12);
+        let left = || recordings(dir.path(), "s").into_iter().map(|f| f.path).collect::<Vec<_>>();
+        let of = |i: usize| dir.path().join(&names[i]);
+        // All finished ones before the first unfinished one.
+        enforce_quota(dir.path(), "s", 3000, Some(&current));
+        assert_eq!(left(), [of(1), of(2), current.clone()]);
         // Nothing but protected files is left at last; the current one stays even above the quota.
         enforce_quota(dir.path(), "s", 0, Some(&current));
-        let left: Vec<_> = recordings(dir.path(), "s").into_iter().map(|f| f.path).collect();
-        assert_eq!(left, [dir.path().join(&names[1]), dir.path().join(&names[2]), current]);
+        assert_eq!(left(), [of(2), current]);
     }
 
     #[test]
@@ -244,6 +265,13 @@ mod tests {
         assert_ne!(first, second);
         assert_eq!((n, again), (1, 2));
         assert!(create(&dir.path().join("missing"), "s", 5, &mut n).is_err());
+        // The last number of all does not run over.
+        let mut last = u64::MAX;
+        let (path, _held) = create(dir.path(), "s", 5, &mut last).unwrap();
+        assert!(path.ends_with("s-19700101T000000.000-18446744073709551615.mcap"), "{path:?}");
+        assert!(create(dir.path(), "s", 5, &mut last).is_err());
+        assert!(create(dir.path(), "s", 2_000_000, &mut last).is_ok());
+        assert_eq!(last_number(dir.path(), "s"), u64::MAX);
     }
 
     #[test]

@@ -24,6 +24,9 @@ pub const CHUNK_AGE: Duration = Duration::from_secs(3);
 /// Bytes of a message record before its data: opcode, length, channel, sequence, two times.
 const MESSAGE_HEAD: usize = 1 + 8 + 2 + 4 + 8 + 8;
 const OP_MESSAGE: u8 = 0x05;
+/// Chunks after which a file is full, whatever its size: the MCAP writer keeps 136 bytes of each until the end, with
+/// indexes about 30 more a channel. A quiet stack closes one every three seconds: 27 h a file, and 4.3 MiB.
+pub const MAX_CHUNKS: u32 = 32_768;
 /// zstd level: 3 saves another tenth of a quiet stack's bytes over 1; above it nothing is gained.
 const LEVEL: u32 = 3;
 
@@ -39,6 +42,7 @@ pub struct RecordingFile {
     raw: Vec<u8>,
     chunk_bytes: usize,
     chunk_since: Option<Instant>,
+    chunks: u32,
 }
 
 /// What a channel is made of.
@@ -69,8 +73,9 @@ impl RecordingFile {
             .compression_level(LEVEL)
             .compression_threads(0)
             .use_chunks(true)
-            // Never reached: chunks are closed here, because their raw messages must go with them.
-            .chunk_size(Some(16 * CHUNK_BYTES as u64))
+            // Never reached: chunks are closed here, because their raw messages must go with them. A buffer of this size is
+            // allocated a file.
+            .chunk_size(Some(2 * CHUNK_BYTES as u64))
             .emit_message_indexes(index)
             // Chunk indexes alone are an error to some readers (Foxglove), a file without any is not.
             .emit_chunk_indexes(index)
@@ -84,6 +89,7 @@ impl RecordingFile {
             raw: Vec::with_capacity(CHUNK_BYTES),
             chunk_bytes: 0,
             chunk_since: None,
+            chunks: 0,
         })
     }
 
@@ -159,6 +165,7 @@ impl RecordingFile {
         let raw_end = self.written.load(Ordering::Relaxed) + self.raw_in_file;
         self.raw.clear();
         self.raw_in_file = 0;
+        self.chunks = self.chunks.saturating_add(u32::from(self.chunk_bytes > 0));
         self.chunk_bytes = 0;
         self.chunk_since = None;
         self.writer.flush()?;
@@ -190,6 +197,11 @@ impl RecordingFile {
     /// Bytes of the file now.
     pub fn bytes(&self) -> u64 {
         self.written.load(Ordering::Relaxed) + self.raw_in_file
+    }
+
+    /// Whether another file should begin, although this one may be small: [`MAX_CHUNKS`].
+    pub fn is_full(&self) -> bool {
+        self.chunks >= MAX_CHUNKS
     }
 
     /// Writes index and end.
@@ -238,6 +250,24 @@ mod tests {
                 file.finish().unwrap_err();
             }
         }
+    }
+
+    #[test]
+    fn a_file_of_many_small_chunks_is_full() {
+        let dir = crate::testing::TempDir::new("chunks");
+        let handle = File::options().read(true).write(true).create_new(true).open(dir.path().join("a.mcap"));
+        let mut file = RecordingFile::new(Arc::new(handle.unwrap()), Compression::None, false).unwrap();
+        let channel = file.add_channel(&gaps_channel()).unwrap();
+        let now = Instant::now();
+        for n in 1..=MAX_CHUNKS {
+            assert!(!file.is_full(), "{n}");
+            file.message(&head(channel, n), b"{}", now).unwrap();
+            // Closing twice is closing once.
+            file.close_chunk().unwrap();
+            file.close_chunk().unwrap();
+        }
+        assert!(file.is_full());
+        file.finish().unwrap();
     }
 
     #[test]

@@ -141,7 +141,7 @@ pub fn recording_metadata(
     stack: &Stack,
     recorder: &str,
     generation: u32,
-    n: u32,
+    n: u64,
 ) -> BTreeMap<String, String> {
     let stack_hash = xxhash_rust::xxh3::xxh3_64(stack.text.as_bytes());
     BTreeMap::from([

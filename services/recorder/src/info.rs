@@ -193,14 +193,21 @@ impl fmt::Display for Info {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let of = |key: &str| self.recording.get(key).map_or("-", String::as_str);
         writeln!(f, "{}", self.path.display())?;
-        writeln!(
-            f,
-            "  stack      {} ({}), build {}, host {}",
-            of("stack"),
-            of("stack_file"),
-            of("build"),
-            of("host")
-        )?;
+        if self.recording.contains_key("imported_from") {
+            let (from, what) = (of("imported_from"), of("imported_as"));
+            let unknown = self.recording.get("direction").is_some_and(|v| v == "unknown");
+            let direction = if unknown { "; it does not tell sent frames from received ones" } else { "" };
+            writeln!(f, "  imported   from {from} ({what}), host {}{direction}", of("host"))?;
+        } else {
+            writeln!(
+                f,
+                "  stack      {} ({}), build {}, host {}",
+                of("stack"),
+                of("stack_file"),
+                of("build"),
+                of("host")
+            )?;
+        }
         writeln!(f, "  state      {}", self.state())?;
         if let Some(sealed) = &self.sealed {
             let lost = sealed.get("bytes_lost").map_or("?", String::as_str);

@@ -115,6 +115,8 @@ struct Open {
     file: Arc<File>,
     path: PathBuf,
     since: Instant,
+    /// Of the file without a message.
+    empty_bytes: u64,
     gaps_channel: u16,
     gaps_seq: u32,
     /// What was written last.
@@ -147,7 +149,8 @@ pub struct Writer {
     /// When to try again, while paused.
     retry_at: Option<Instant>,
     housekeeping_at: Instant,
-    n: u32,
+    /// Number of the file begun last; counts on where the files of the folder end.
+    n: u64,
     finished_bytes: u64,
     finished_messages: u64,
     dropped: u64,
@@ -216,6 +219,7 @@ impl Writer {
         .ok();
         let old: Vec<_> = disk::recordings(&self.dir, &self.stack.name).into_iter().map(|f| f.path).collect();
         disk::remove_half_sealed(&self.dir, &self.stack.name);
+        self.n = disk::last_number(&self.dir, &self.stack.name);
         self.try_open();
         self.seal_in_background(old);
         loop {
@@ -340,7 +344,8 @@ impl Writer {
     fn rotates_before(&mut self, batch: &Batch, entry: &Entry, now: Instant) -> bool {
         let Some(open) = &mut self.open else { return false };
         let aged = self.config.max_time.is_some_and(|t| now.duration_since(open.since) >= t.duration());
-        if open.due.is_none() && (aged || open.mcap.bytes() >= self.config.max_size.0) {
+        let full = open.mcap.bytes() >= self.config.max_size.0 || open.mcap.is_full();
+        if open.due.is_none() && (aged || full) {
             open.due = Some(now);
             let plcs = self.topics.iter().any(|t| t.kind == TopicKind::Keyframe);
             self.shared.keyframe_wanted.store(plcs, Ordering::Relaxed);
@@ -399,10 +404,16 @@ impl Writer {
     /// The disk failed in the middle of a file.
     fn fail(&mut self, error: &McapError) {
         let Some(open) = self.open.take() else { return };
-        self.finished_bytes += open.mcap.bytes();
+        let bytes = open.mcap.bytes();
         open.mcap.abandon();
+        self.finished_bytes += bytes;
+        if bytes <= open.empty_bytes {
+            // A disk that takes the beginning of a file and no more would be covered with beginnings.
+            let _ = std::fs::remove_file(&open.path);
+        } else {
+            self.broken.push(open.path.clone());
+        }
         self.begin_counting();
-        self.broken.push(open.path.clone());
         // An I/O error is the source; the crate's own text only says "I/O error".
         let cause = match error {
             McapError::Io(e) => e.to_string(),
@@ -509,6 +520,7 @@ impl Writer {
         mcap.close_chunk()?;
         let now = Instant::now();
         Ok(Open {
+            empty_bytes: mcap.bytes(),
             mcap,
             file,
             path: path.to_owned(),

@@ -100,6 +100,18 @@ fn without_a_keyframe_a_due_file_ends_all_the_same() {
 }
 
 #[test]
+fn numbers_go_on_where_the_last_recorder_ended() {
+    let dir = TempDir::new("numbers");
+    let mut all = Vec::new();
+    for _ in 0..3 {
+        all = Rig::start(stack(dir.path()), Config::default()).stop();
+    }
+    let ends: Vec<_> = all.iter().map(|f| f.to_str().unwrap().rsplit_once('-').unwrap().1).collect();
+    assert_eq!(ends, ["1.mcap", "2.mcap", "3.mcap"]);
+    assert_eq!(info(&all[2]).unwrap().recording["file"], "3");
+}
+
+#[test]
 fn the_quota_deletes_the_oldest_files() {
     let dir = TempDir::new("quota");
     let config = Config {

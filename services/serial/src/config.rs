@@ -171,6 +171,30 @@ pub struct Config {
     pub pace: bool,
 }
 
+/// What is wrong with a `device` that is none of the forms, and what to write.
+fn no_device(text: &str) -> (String, String) {
+    let help = "write e.g. device = \"/dev/ttyUSB0\", better its name in /dev/serial/by-id; \"socket://host:port\" for a port over TCP, \"pty:/tmp/com1\" for a pseudo-terminal; `dinrail serial list` lists ports";
+    let plain = |message: String| (message, help.to_owned());
+    if text.is_empty() || text.contains("://") || text.starts_with("pty:") {
+        return plain(format!("'{text}' is no serial device"));
+    }
+    let name = text.trim_start_matches("./");
+    let port = name.strip_prefix("COM").or_else(|| name.strip_prefix("com"));
+    if let Some(number) = port.and_then(|n| n.parse::<u32>().ok()) {
+        let help = format!(
+            "name the device, e.g. device = \"/dev/ttyS{}\"; name = \"com{number}\" in [[service]] makes it COM{number} for the rest of the stack",
+            number.saturating_sub(1)
+        );
+        return (format!("'{text}' is no device of Linux"), help);
+    }
+    let message = format!("'{text}' is a relative path: it is not looked for in any folder");
+    if name.starts_with("tty") || name.starts_with("serial/") || name.starts_with("dev/") {
+        let whole = name.trim_start_matches("dev/");
+        return (message, format!("write device = \"/dev/{whole}\""));
+    }
+    plain(message)
+}
+
 fn yes() -> bool {
     true
 }
@@ -341,8 +365,7 @@ impl Config {
 
     fn check_device(&self, service: &str, dir: &Path, found: &mut Vec<Finding>) {
         let Some(target) = Target::parse(&self.device, dir) else {
-            let message = format!("'{}' is no serial device", self.device);
-            let help = "write e.g. device = \"/dev/ttyUSB0\", better its name in /dev/serial/by-id; \"socket://host:port\" for a port over TCP, \"pty:/tmp/com1\" for a pseudo-terminal; `dinrail serial list` lists ports";
+            let (message, help) = no_device(&self.device);
             found.push(Finding::error(service, "device", message, help));
             return;
         };

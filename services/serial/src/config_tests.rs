@@ -57,6 +57,10 @@ fn mistakes() {
     let all = [
         said(json!({})),
         said(json!({ "device": "COM1" })),
+        said(json!({ "device": "ttyUSB0" })),
+        said(json!({ "device": "./serial/by-id/usb-x" })),
+        said(json!({ "device": "lines/one" })),
+        said(json!({ "device": "socket://nowhere" })),
         said(json!({ "device": "/dev/ttyNOTHERE", "data_bits": 7, "baud": 9 })),
         said(json!({ "framing": "ascii", "data_bits": 6, "stop_bits": 3 })),
         said(json!({ "parity": "none" })),
@@ -71,7 +75,11 @@ fn mistakes() {
         said(json!({ "rs485": "rts", "flow": "rtscts", "max_frame": 0, "timeout": "0" })),
     ];
     insta::assert_snapshot!(all.join("\n"), @r#"
-    Error device: 'COM1' is no serial device -> write e.g. device = "/dev/ttyUSB0", better its name in /dev/serial/by-id; "socket://host:port" for a port over TCP, "pty:/tmp/com1" for a pseudo-terminal; `dinrail serial list` lists ports
+    Error device: 'COM1' is no device of Linux -> name the device, e.g. device = "/dev/ttyS0"; name = "com1" in [[service]] makes it COM1 for the rest of the stack
+    Error device: 'ttyUSB0' is a relative path: it is not looked for in any folder -> write device = "/dev/ttyUSB0"
+    Error device: './serial/by-id/usb-x' is a relative path: it is not looked for in any folder -> write device = "/dev/serial/by-id/usb-x"
+    Error device: 'lines/one' is a relative path: it is not looked for in any folder -> write e.g. device = "/dev/ttyUSB0", better its name in /dev/serial/by-id; "socket://host:port" for a port over TCP, "pty:/tmp/com1" for a pseudo-terminal; `dinrail serial list` lists ports
+    Error device: 'socket://nowhere' is no serial device -> write e.g. device = "/dev/ttyUSB0", better its name in /dev/serial/by-id; "socket://host:port" for a port over TCP, "pty:/tmp/com1" for a pseudo-terminal; `dinrail serial list` lists ports
     Warning device: this machine has no /dev/ttyNOTHERE now -> the driver waits for it; `dinrail serial list` lists ports
     Error baud: baud 9 is out of range -> use 50 to 12000000, e.g. 19200
     Error data_bits: framing "rtu" needs 8 data bits, not 7 -> MODBUS over Serial Line V1.02, 2.5.1: each byte of RTU is sent as 8 data bits; for 7 use framing = "ascii", for 5 to 7 without Modbus framing = "raw", "silence", "length" or "delimiter"

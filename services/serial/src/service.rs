@@ -183,6 +183,9 @@ struct Open {
 struct Status<'a> {
     state: &'static str,
     device: &'a str,
+    /// As in the stack file.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    number: Option<u32>,
     /// The device itself, links followed.
     #[serde(skip_serializing_if = "Option::is_none")]
     path: Option<&'a str>,
@@ -216,6 +219,8 @@ struct Service {
     tx: Subscriber<SerialChunk>,
     reactor: Reactor,
     alarm: Wake,
+    /// What it is set to; `None`: it is not, or has rung.
+    alarm_ns: Option<u64>,
     opener: Opener,
     line: Line,
     backoff_ns: u64,
@@ -248,6 +253,7 @@ impl Service {
             options,
             reactor,
             alarm,
+            alarm_ns: None,
             opener: Opener::new().map_err(system("making a pipe"))?,
             line: Line::Closed(0),
             backoff_ns: BACKOFF_NS.0,
@@ -284,6 +290,9 @@ impl Service {
                 _ => (false, false),
             };
             let (rang, ended, opened, beaten) = (is(rail), is(shutdown), is(opened), is(beat));
+            if is(self.alarm) {
+                self.alarm_ns = None;
+            }
             if ended {
                 self.sum_up();
                 return Ok(());
@@ -387,6 +396,11 @@ impl Service {
                 open.driver.deadline()
             }
         };
+        // A call to the system for each wake-up would be more than the rest of it.
+        if self.alarm_ns == due {
+            return Ok(());
+        }
+        self.alarm_ns = due;
         match due {
             Some(at_ns) => self.reactor.set_alarm(self.alarm, at_ns),
             None => self.reactor.set_timer(self.alarm, Duration::ZERO, Duration::ZERO),
@@ -507,6 +521,7 @@ impl Service {
                 Line::Open(_) => "open",
             },
             device: &self.config.device,
+            number: self.config.number,
             path: port.map(|p| p.port().path()),
             kind: port.map(|p| p.port().kind()),
             character: self.options.character.to_string(),

@@ -1,7 +1,7 @@
 // A device made of node-canopen. Usage: node canopen_slave.js PORT EDS NODE-ID SERIAL
 //
 // An I/O device by its EDS whose inputs show its outputs. node-canopen sends no boot-up message and knows no $NODEID: both
-// are done here, as an application of it must. It prints what happens to it.
+// are done here, as an application of it must. `emcy` on stdin sends an emergency. It prints what happens to it.
 
 'use strict';
 
@@ -115,3 +115,8 @@ bus.onReady = () => {
     device.start();
     say('ready');
 };
+
+process.stdin.on('data', (text) => {
+    if (text.toString().includes('emcy'))
+        device.emcy.write(0x4210, Buffer.from('heat!'));
+});

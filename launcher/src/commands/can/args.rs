@@ -24,8 +24,9 @@ pub enum CanCommand {
 /// Which frames.
 #[derive(Debug, Clone, Args)]
 pub struct FilterArgs {
-    /// 123, 123:7F0 (identifier:mask), 123~7F0 (all others), 100-1FF, 18FEF100, a signal's name, #error, #rtr, #fd,
-    /// #ext, #tx, #rx; ! in front turns it round; several: any that fits and none that is turned round
+    /// 123, 123:7F0 (identifier:mask), 123~7F0 (all others), 100-1FF, 18FEF100, a name as `can dump` shows it (Speed,
+    /// "TPDO1 5", "SDO 5", heartbeat, "node 5"), #error, #rtr, #fd, #ext, #tx, #rx; ! in front turns it round; several:
+    /// any that fits and none that is turned round
     #[arg(long = "filter", value_name = "FILTER", value_delimiter = ',', allow_hyphen_values = true)]
     pub filter: Vec<String>,
 }
@@ -47,26 +48,35 @@ pub struct DumpArgs {
     #[command(flatten)]
     pub filter: FilterArgs,
     /// Stop after so many frames
-    #[arg(long)]
+    #[arg(long, short = 'n')]
     pub count: Option<u64>,
     /// Stop after so long
     #[arg(long = "for", value_name = "DURATION")]
     pub duration: Option<Span>,
+    /// Stop when no frame came for so long
+    #[arg(long, value_name = "DURATION")]
+    pub silence: Option<Span>,
     /// Also write every frame shown to a file, as `candump -L` does; `-` prints such lines instead
     #[arg(long, value_name = "FILE")]
     pub log: Option<PathBuf>,
     /// Show frames as for a terminal, whatever the output is
-    #[arg(long, conflicts_with = "log_lines")]
+    #[arg(long)]
     pub screen: bool,
     /// Print `candump -L` lines, as is done when the output is no terminal
-    #[arg(long = "lines")]
+    #[arg(long = "lines", conflicts_with_all = ["screen", "absolute", "delta", "since_start", "ascii"])]
     pub log_lines: bool,
+    /// `T` (sent by the stack) or `R` (received) behind each `candump -L` line, as `candump -x` does
+    #[arg(long, conflicts_with_all = ["screen", "absolute", "delta", "since_start", "ascii"])]
+    pub direction: bool,
     /// Seconds since 1970 instead of the time of day
     #[arg(long)]
     pub absolute: bool,
     /// Time since the frame before instead of the time of day
     #[arg(long, conflicts_with = "absolute")]
     pub delta: bool,
+    /// Time since the first frame instead of the time of day
+    #[arg(long, conflicts_with_all = ["absolute", "delta"])]
+    pub since_start: bool,
     /// The data as text, too
     #[arg(long)]
     pub ascii: bool,
@@ -87,7 +97,7 @@ pub struct SendArgs {
     #[arg(required = true)]
     pub frames: Vec<String>,
     /// Send all of them so often
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, short = 'n', default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     pub count: u64,
     /// From one time to the next
     #[arg(long, value_name = "DURATION")]
@@ -98,8 +108,8 @@ pub struct SendArgs {
 
 #[derive(Debug, Args)]
 pub struct GenArgs {
-    /// CAN service of the stack
-    pub bus: String,
+    /// CAN service of the stack; may be left out when there is one
+    pub bus: Option<String>,
     /// An identifier; `inc` or `inc:100` counts up (from there), `random`
     #[arg(long, default_value = "random")]
     pub id: String,
@@ -113,7 +123,7 @@ pub struct GenArgs {
     #[arg(long, default_value = "200ms", value_name = "DURATION")]
     pub gap: Span,
     /// Stop after so many frames
-    #[arg(long)]
+    #[arg(long, short = 'n', value_parser = clap::value_parser!(u64).range(1..))]
     pub count: Option<u64>,
     /// Stop after so long
     #[arg(long = "for", value_name = "DURATION")]
@@ -173,7 +183,10 @@ pub struct ReplayArgs {
     /// End so long behind the first frame
     #[arg(long, value_name = "DURATION")]
     pub to: Option<Span>,
-    /// Leave out what the logging side had sent itself
+    /// Longer pauses of the file are cut to this
+    #[arg(long, value_name = "DURATION", conflicts_with = "no_wait")]
+    pub max_gap: Option<Span>,
+    /// Leave out what the logging side had sent itself; refused where the file does not tell that
     #[arg(long)]
     pub received_only: bool,
     #[command(flatten)]
@@ -196,8 +209,8 @@ pub struct StatsArgs {
 
 #[derive(Debug, Args)]
 pub struct SniffArgs {
-    /// CAN service of the stack
-    pub bus: String,
+    /// CAN service of the stack; may be left out when there is one
+    pub bus: Option<String>,
     #[command(flatten)]
     pub filter: FilterArgs,
     /// Stop after so long

@@ -1,6 +1,6 @@
 //! Which frames are shown: identifiers, masks, ranges, names, kinds.
 
-use super::names::Names;
+use super::names::{Ids, Names};
 use crate::commands::UsageError;
 use crate::stackfile::suggestion;
 use ipc_types::payload::{CanFrame, can_flag, id_flag};
@@ -18,8 +18,8 @@ enum Test {
         to: u32,
         extended: bool,
     },
-    /// Bus (any when `None`) and identifier with its flag.
-    Named(Vec<(String, u32)>),
+    /// Identifiers of each bus.
+    Named(Ids),
     Error,
     Remote,
     Fd,
@@ -59,6 +59,11 @@ impl Filter {
         Ok(filter)
     }
 
+    /// Whether it asks who sent a frame.
+    pub fn asks_direction(&self) -> bool {
+        self.any.iter().chain(&self.none).any(|test| matches!(test, Test::Sent | Test::Received))
+    }
+
     /// Whether a frame is shown.
     pub fn takes(&self, bus: &str, frame: &CanFrame) -> bool {
         let fits = |test: &Test| test.fits(bus, frame);
@@ -74,7 +79,7 @@ impl Test {
             Self::Range { from, to, extended } => same(*extended) && (*from..=*to).contains(&frame.id()),
             Self::Named(ids) => {
                 let id = frame.id() | (frame.can_id & id_flag::EFF);
-                !frame.is_error() && ids.iter().any(|(on, named)| *named == id && on == bus)
+                !frame.is_error() && ids.get(bus).is_some_and(|ids| ids.contains(&id))
             }
             Self::Error => frame.is_error(),
             Self::Remote => frame.is_remote() && !frame.is_error(),
@@ -87,6 +92,13 @@ impl Test {
 }
 
 fn parse_one(text: &str, names: &Names, turned: &mut bool) -> Result<Test, UsageError> {
+    // A signal may be called `error`; `#error` never is, nor an identifier.
+    if !text.starts_with('#') && identifier(text).is_none() {
+        let signals = names.find_signal(text);
+        if !signals.is_empty() {
+            return Ok(Test::Named(signals));
+        }
+    }
     // Without the # as well: shells take it for a comment where it is not quoted.
     let kind = KINDS
         .iter()
@@ -123,14 +135,9 @@ fn parse_one(text: &str, names: &Names, turned: &mut bool) -> Result<Test, Usage
     if !ids.is_empty() {
         return Ok(Test::Named(ids));
     }
-    let all = names.all();
-    let known = if all.is_empty() {
-        "the stack gives no names to frames".to_owned()
-    } else {
-        suggestion(text, "names in this stack", all.iter().map(String::as_str))
-    };
     Err(UsageError(format!(
-        "filter '{text}' is neither an identifier (3 or 8 hex digits; 123:7F0, 123~7F0, 100-1FF) nor a kind (#error, #rtr, #fd, #ext, #tx, #rx) nor a name\n{known}"
+        "filter '{text}' is neither an identifier (3 or 8 hex digits; 123:7F0, 123~7F0, 100-1FF) nor a kind (#error, #rtr, #fd, #ext, #tx, #rx) nor a name\n{}",
+        names.unknown(text)
     )))
 }
 
@@ -232,6 +239,18 @@ filter '' is neither an identifier (3 or 8 hex digits; 123:7F0, 123~7F0, 100-1FF
 names in this stack: Level, Speed, Temperature
 "#);
         let none = Filter::parse(&["Speed".to_owned()], &Names::default()).unwrap_err().to_string();
-        assert!(none.ends_with("the stack gives no names to frames"), "{none}");
+        assert!(none.contains("nor a name\nthe stack gives no names to frames"), "{none}");
+    }
+
+    #[test]
+    fn a_signal_may_have_the_name_of_a_kind() {
+        let names = Names::of_table(&[("can0", 0x1A0, "Error"), ("can0", 0x123, "1A0")]);
+        let test = |text: &str| Filter::parse(&[text.to_owned()], &names).unwrap();
+        let speed = CanFrame::classic(0x1A0, &[]);
+        assert!(test("error").takes("can0", &speed) && !test("#error").takes("can0", &speed));
+        assert!(test("1A0").takes("can0", &speed));
+        assert!(
+            test("!#tx").asks_direction() && test("rx").asks_direction() && !test("error").asks_direction()
+        );
     }
 }

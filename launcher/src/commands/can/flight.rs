@@ -6,7 +6,8 @@
 
 use dinrail_can::protocol::frame::Frame;
 use ipc_types::payload::CanFrame;
-use std::collections::VecDeque;
+use std::collections::{HashSet, VecDeque};
+use std::hash::{DefaultHasher, Hash, Hasher};
 
 use super::to_frame;
 
@@ -14,6 +15,8 @@ use super::to_frame;
 const EXACT_WINDOW: usize = 64;
 /// Frames under way at most when it does not.
 const LOOSE_WINDOW: usize = 256;
+/// Different frames that are remembered once they were seen.
+const MAX_CONTENTS: usize = 65_536;
 
 /// What becomes of the order of frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -24,18 +27,50 @@ pub enum Order {
     ByIdentifier,
 }
 
+/// What a frame that the stack had sent was.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Sight {
+    /// One of these, in its turn.
+    Ours,
+    /// Equal to one of these whose turn it is not: somebody else's, or ours out of order.
+    Early,
+    /// Equal to one that was sent, with none left to be seen: somebody else's.
+    Equal,
+    /// None of these.
+    Other,
+}
+
+#[derive(Debug)]
+struct Waiting {
+    key: u32,
+    frame: Frame,
+    /// How often an equal frame was seen before its turn.
+    early: u64,
+}
+
 /// See the module.
 #[derive(Debug)]
 pub struct Flight {
     order: Order,
-    waiting: VecDeque<(u32, Frame)>,
+    waiting: VecDeque<Waiting>,
+    contents: HashSet<u64>,
     echoed: u64,
     out_of_order: u64,
+    equal: u64,
+    first_early: Option<Frame>,
 }
 
 impl Flight {
     pub fn new(order: Order) -> Self {
-        Self { order, waiting: VecDeque::with_capacity(LOOSE_WINDOW), echoed: 0, out_of_order: 0 }
+        Self {
+            order,
+            waiting: VecDeque::with_capacity(LOOSE_WINDOW),
+            contents: HashSet::new(),
+            echoed: 0,
+            out_of_order: 0,
+            equal: 0,
+            first_early: None,
+        }
     }
 
     /// Whether a frame may go now.
@@ -44,7 +79,7 @@ impl Flight {
             Order::ByIdentifier => self.waiting.len() < LOOSE_WINDOW,
             Order::Exact => {
                 let key = to_frame(frame).arbitration_key();
-                self.waiting.len() < EXACT_WINDOW && self.waiting.back().is_none_or(|(last, _)| key >= *last)
+                self.waiting.len() < EXACT_WINDOW && self.waiting.back().is_none_or(|last| key >= last.key)
             }
         }
     }
@@ -52,24 +87,58 @@ impl Flight {
     /// A frame went.
     pub fn sent(&mut self, frame: &CanFrame) {
         let frame = to_frame(frame);
-        self.waiting.push_back((frame.arbitration_key(), frame));
+        if self.contents.len() < MAX_CONTENTS {
+            self.contents.insert(content(&frame));
+        }
+        self.waiting.push_back(Waiting { key: frame.arbitration_key(), frame, early: 0 });
     }
 
-    /// A frame of the stack was on the bus. Whether it was one of these.
-    pub fn seen(&mut self, message: &CanFrame) -> bool {
+    /// A frame of the stack was on the bus.
+    ///
+    /// An echo does not tell which process sent it. So when order counts a frame is taken for ours only in its turn;
+    /// an equal one before that may be somebody else's and is remembered: see [`Self::accept_early`].
+    pub fn seen(&mut self, message: &CanFrame) -> Sight {
         let seen = to_frame(message);
-        let Some(at) = self.waiting.iter().position(|(_, frame)| *frame == seen) else { return false };
-        self.waiting.remove(at);
-        self.echoed += 1;
-        if at > 0 && self.order == Order::Exact {
-            self.out_of_order += 1;
+        match self.waiting.iter().position(|w| w.frame == seen) {
+            Some(at) if at > 0 && self.order == Order::Exact => {
+                self.waiting[at].early += 1;
+                Sight::Early
+            }
+            Some(at) => {
+                // Seen in its turn: what was seen before was not it.
+                self.equal += self.waiting.remove(at).map_or(0, |w| w.early);
+                self.echoed += 1;
+                Sight::Ours
+            }
+            None if self.contents.contains(&content(&seen)) => {
+                self.equal += 1;
+                Sight::Equal
+            }
+            None => Sight::Other,
         }
-        true
+    }
+
+    /// Whether it is the turn of a frame that was seen, but earlier.
+    pub fn is_early(&self) -> bool {
+        self.waiting.front().is_some_and(|w| w.early > 0)
+    }
+
+    /// It was not seen in its turn: what was seen early was it, out of order.
+    pub fn accept_early(&mut self) {
+        if !self.is_early() {
+            return;
+        }
+        if let Some(first) = self.waiting.pop_front() {
+            self.echoed += 1;
+            self.out_of_order += 1;
+            self.equal += first.early.saturating_sub(1);
+            self.first_early.get_or_insert(first.frame);
+        }
     }
 
     /// The frame that has waited longest.
     pub fn oldest(&self) -> Option<&Frame> {
-        self.waiting.front().map(|(_, frame)| frame)
+        self.waiting.front().map(|w| &w.frame)
     }
 
     /// Frames that have not been seen.
@@ -86,6 +155,24 @@ impl Flight {
     pub fn out_of_order(&self) -> u64 {
         self.out_of_order
     }
+
+    /// The first of [`Self::out_of_order`].
+    pub fn first_out_of_order(&self) -> Option<&Frame> {
+        self.first_early.as_ref()
+    }
+
+    /// Frames equal to these that somebody else of the stack sent meanwhile. Of the first [`MAX_CONTENTS`] different
+    /// frames.
+    pub fn equal(&self) -> u64 {
+        self.equal
+    }
+}
+
+/// A hash of the whole frame.
+fn content(frame: &Frame) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    (frame.can_id, frame.len, frame.fd, frame.payload()).hash(&mut hasher);
+    hasher.finish()
 }
 
 #[cfg(test)]
@@ -109,21 +196,63 @@ mod tests {
         }
         assert!(!flight.has_room(&frame("100#06")));
         // Not ours: other data.
-        assert!(!flight.seen(&frame("100#07")));
+        assert_eq!(flight.seen(&frame("100#07")), Sight::Other);
         for text in ["100#01", "100#02", "200#03", "08000000#04"] {
-            assert!(flight.seen(&frame(text)) && !flight.has_room(&frame("100#06")));
+            assert!(flight.seen(&frame(text)) == Sight::Ours && !flight.has_room(&frame("100#06")));
         }
-        assert!(flight.seen(&frame("7FF#05")) && flight.has_room(&frame("100#06")));
+        assert!(flight.seen(&frame("7FF#05")) == Sight::Ours && flight.has_room(&frame("100#06")));
         assert_eq!((flight.len(), flight.echoed(), flight.out_of_order()), (0, 5, 0));
     }
 
+    /// Sends the first list, sees the second: what was seen, and the counts echoed, out of order, equal.
+    fn flown(order: Order, sent: &str, seen: &str) -> (String, [u64; 3]) {
+        let mut flight = Flight::new(order);
+        sent.split(' ').for_each(|text| flight.sent(&frame(text)));
+        let sights = seen.split(' ').map(|text| match flight.seen(&frame(text)) {
+            Sight::Ours => 'o',
+            Sight::Early => 'e',
+            Sight::Equal => '=',
+            Sight::Other => '-',
+        });
+        let sights = sights.collect();
+        while flight.is_early() {
+            flight.accept_early();
+        }
+        (sights, [flight.echoed(), flight.out_of_order(), flight.equal()])
+    }
+
     #[test]
-    fn what_overtakes_is_counted() {
-        let mut flight = Flight::new(Order::Exact);
-        flight.sent(&frame("100#01"));
-        flight.sent(&frame("100#02"));
-        assert!(flight.seen(&frame("100#02")) && flight.seen(&frame("100#01")));
-        assert_eq!((flight.echoed(), flight.out_of_order()), (2, 1));
+    fn what_overtakes_is_counted_apart_from_equal_frames_of_others() {
+        for (sent, seen, sights, counts) in [
+            ("100#01 100#02", "100#01 100#02", "oo", [2, 0, 0]),
+            // Ours, the other way round.
+            ("100#01 100#02", "100#02 100#01", "eo", [2, 1, 0]),
+            // Somebody else's between ours, before ours and behind ours.
+            ("100#01 100#02", "100#02 100#01 100#02", "eoo", [2, 0, 1]),
+            ("100#01 100#02", "100#01 100#01 100#02 100#02", "o=o=", [2, 0, 2]),
+            ("100#01 100#02", "100#02 100#02 100#01", "eeo", [2, 1, 1]),
+            ("100#01 100#01", "100#01 100#01 100#01", "oo=", [2, 0, 1]),
+            // Not seen at all, and something else.
+            ("100#01 100#02", "100#02 101#02", "e-", [0, 0, 0]),
+        ] {
+            assert_eq!(flown(Order::Exact, sent, seen), (sights.to_owned(), counts), "{sent} | {seen}");
+        }
+        assert_eq!(
+            flown(Order::ByIdentifier, "200#01 100#01", "100#01 200#01 100#01"),
+            ("oo=".to_owned(), [2, 0, 1])
+        );
+    }
+
+    #[test]
+    fn the_memory_for_frames_has_a_limit() {
+        let mut flight = Flight::new(Order::ByIdentifier);
+        for i in 0..=MAX_CONTENTS as u32 {
+            let frame = CanFrame::classic(0x100, &i.to_le_bytes());
+            flight.sent(&frame);
+            assert_eq!(flight.seen(&frame), Sight::Ours);
+        }
+        assert_eq!(flight.contents.len(), MAX_CONTENTS);
+        assert_eq!(flight.seen(&CanFrame::classic(0x100, &[0; 4])), Sight::Equal);
     }
 
     proptest! {
@@ -151,7 +280,7 @@ mod tests {
                 }
                 for _ in 0..pace[step % pace.len()].max(usize::from(step % 7 == 0)) {
                     if let Some(waiting) = queue.pop() {
-                        prop_assert!(flight.seen(&from_frame(&waiting.frame)));
+                        prop_assert_eq!(flight.seen(&from_frame(&waiting.frame)), Sight::Ours);
                         out.push(waiting.frame);
                     }
                 }

@@ -14,7 +14,8 @@ pub fn run(args: &GenArgs, json: bool) -> anyhow::Result<ExitCode> {
     let mut pattern = Pattern::of(args)?;
     let mut ctx = super::join(args.which.stack.as_deref())?;
     let order = if args.in_order { Order::Exact } else { Order::ByIdentifier };
-    let mut sender = Sender::new(&mut ctx, &args.bus, order)?;
+    let bus = super::one_bus(&ctx, args.bus.as_deref())?;
+    let mut sender = Sender::new(&mut ctx, &bus, order)?;
     let mut reactor = Reactor::new()?;
     let stop = reactor.add(ctx.shutdown_fd())?;
     let (gap, begin) = (args.gap.duration(), Instant::now());
@@ -48,7 +49,11 @@ pub fn run(args: &GenArgs, json: bool) -> anyhow::Result<ExitCode> {
         }
     }
     let why = why.or_else(|| sender.finish());
-    Ok(report(&args.bus, &sender.counts(), begin.elapsed(), why.as_deref(), args.in_order, json))
+    let code = report(&bus, &sender.counts(), begin.elapsed(), why.as_deref(), args.in_order, json);
+    for remark in sender.remarks() {
+        eprintln!("dinrail: {remark}");
+    }
+    Ok(code)
 }
 
 /// What was done, and whether all of it was seen.
@@ -74,8 +79,8 @@ fn report(
         eprintln!("dinrail: {why}");
     }
     match () {
-        () if whole && why.is_none() => ExitCode::SUCCESS,
         () if counts.echoed == 0 => ExitCode::FAILURE,
+        () if whole && why.is_none() => ExitCode::SUCCESS,
         () => ExitCode::from(DATA_LOSS),
     }
 }

@@ -1,9 +1,11 @@
 //! `dinrail can`: what candump, cansend, cangen, canplayer, canbusload and cansniffer do, on the buses of a stack.
 //!
-//! [`args`] the arguments; [`filter`], [`names`], [`merge`], [`show`] which frames and how they look; [`listen`]
-//! reading buses; [`flight`] and [`sender`] sending without loss; [`source`] logs and recordings; one module a verb.
+//! [`args`] the arguments; [`filter`], [`names`], [`canopen_names`], [`merge`], [`show`] which frames and how they look;
+//! [`listen`] reading buses; [`flight`] and [`sender`] sending without loss; [`source`] logs and recordings; one module
+//! a verb.
 
 pub mod args;
+mod canopen_names;
 mod dump;
 mod filter;
 mod flight;
@@ -21,6 +23,7 @@ mod sniff;
 pub mod source;
 mod stats;
 
+use crate::commands::UsageError;
 use crate::stackfile::nearest;
 use crate::supervise::client::{find, is_full, observe};
 use args::CanCommand;
@@ -90,6 +93,25 @@ fn buses(ctx: &Context, asked: &[String]) -> anyhow::Result<Vec<String>> {
         }
     }
     Ok(chosen)
+}
+
+/// The bus meant; of one bus it need not be named.
+fn one_bus(ctx: &Context, asked: Option<&str>) -> anyhow::Result<String> {
+    match asked {
+        Some(bus) => topic(ctx, bus, TopicKind::CanRx).map(|_| bus.to_owned()),
+        None => match all_buses(ctx).as_slice() {
+            [] => anyhow::bail!("stack '{}' has no CAN bus", ctx.stack.name),
+            [only] => Ok(only.clone()),
+            several => {
+                let several = several.join(", ");
+                Err(UsageError(format!(
+                    "stack '{}' has several CAN buses: name one of {several}",
+                    ctx.stack.name
+                ))
+                .into())
+            }
+        },
+    }
 }
 
 /// The topic of a bus, or an error that lists the buses.

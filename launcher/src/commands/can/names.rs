@@ -1,26 +1,38 @@
-//! What the stack calls its frames: signals of `can-io`, the predefined objects of CANopen.
+//! What the stack calls its frames: signals of `can-io`, and on a bus with a CANopen service its PDOs with the mapped
+//! objects, SDO, heartbeat and so on (see [`super::canopen_names`]).
 
+use super::canopen_names::{Network, Wanted, names_of_node};
+use crate::stackfile::{nearest, suggestion};
 use dinrail_can_io::plan::plan;
 use dinrail_can_io::protocol::value::{Codec, IecType};
+use dinrail_canopen::config::{MasterConfig, SlaveConfig};
 use dinrail_iec::Addressing;
 use ipc_types::payload::{CanFrame, id_flag};
 use ipc_types::stack::Stack;
 use ipc_types::topic::TopicKind;
 use std::collections::{BTreeMap, BTreeSet};
 
+/// Names that are listed to somebody who misspelt one.
+const MAX_LISTED: usize = 60;
+
+/// Buses with identifiers, these with their flag.
+pub type Ids = BTreeMap<String, BTreeSet<u32>>;
+
+/// A part of a frame that has a name.
 #[derive(Debug, Clone)]
-struct Signal {
-    name: String,
-    codec: Option<Codec>,
+pub struct Signal {
+    pub name: String,
+    /// `None`: no value is told.
+    pub codec: Option<Codec>,
 }
 
 /// See the module.
 #[derive(Debug, Clone, Default)]
 pub struct Names {
-    /// By identifier with its flag, and bus.
+    /// Signals of `can-io` by identifier with its flag, and bus.
     signals: BTreeMap<(u32, String), Vec<Signal>>,
     /// Buses with a CANopen service.
-    canopen: BTreeSet<String>,
+    canopen: BTreeMap<String, Network>,
 }
 
 impl Names {
@@ -34,10 +46,16 @@ impl Names {
             let named = service.config.get("bus").and_then(|v| v.as_str());
             let only = (buses.len() == 1).then(|| buses[0]);
             let Some(bus) = named.or(only) else { continue };
+            let config = || service.config.clone();
             if service.kind.starts_with("canopen") {
-                names.canopen.insert(bus.to_owned());
+                let network = names.canopen.entry(bus.to_owned()).or_default();
+                if let Ok(master) = serde_json::from_value::<MasterConfig>(config()) {
+                    network.add_master(&master, &stack.dir);
+                } else if let Ok(slave) = serde_json::from_value::<SlaveConfig>(config()) {
+                    network.add_slave(&slave);
+                }
             } else if service.kind == "can-io"
-                && let Ok(config) = serde_json::from_value::<dinrail_can_io::Config>(service.config.clone())
+                && let Ok(config) = serde_json::from_value::<dinrail_can_io::Config>(config())
             {
                 names.add(bus, &config);
             }
@@ -75,35 +93,108 @@ impl Names {
         names
     }
 
-    /// Every name, sorted.
-    pub fn all(&self) -> Vec<String> {
-        let all: BTreeSet<&String> = self.signals.values().flatten().map(|s| &s.name).collect();
-        all.into_iter().cloned().collect()
+    /// Whether the stack names anything.
+    pub fn is_empty(&self) -> bool {
+        self.signals.is_empty() && self.canopen.is_empty()
     }
 
-    /// Bus and identifier of the frames with this name, whatever its case.
-    pub fn find(&self, name: &str) -> Vec<(String, u32)> {
+    /// The frames with this name, whatever its case: a signal's, or CANopen's with or without a node.
+    pub fn find(&self, name: &str) -> Ids {
+        let signals = self.find_signal(name);
+        if !signals.is_empty() {
+            return signals;
+        }
+        let mut found = Ids::new();
+        let Some(wanted) = Wanted::parse(name) else { return found };
+        for (bus, network) in &self.canopen {
+            let ids = network.ids().filter(|id| {
+                !self.signals.contains_key(&(*id, bus.clone()))
+                    && network.name(*id).is_some_and(|(name, _)| wanted.is(&name))
+            });
+            let ids: BTreeSet<u32> = ids.collect();
+            if !ids.is_empty() {
+                found.insert(bus.clone(), ids);
+            }
+        }
+        found
+    }
+
+    /// The frames that carry a signal or mapped object of this name.
+    pub fn find_signal(&self, name: &str) -> Ids {
+        let mut found = Ids::new();
         let has = |signals: &Vec<Signal>| signals.iter().any(|s| s.name.eq_ignore_ascii_case(name));
-        let found = self.signals.iter().filter(|(_, signals)| has(signals));
-        found.map(|((id, bus), _)| (bus.clone(), *id)).collect()
+        for ((id, bus), _) in self.signals.iter().filter(|(_, signals)| has(signals)) {
+            found.entry(bus.clone()).or_default().insert(*id);
+        }
+        for (bus, network) in &self.canopen {
+            for (id, _) in network.symbols().filter(|(_, symbol)| symbol.eq_ignore_ascii_case(name)) {
+                found.entry(bus.clone()).or_default().insert(id);
+            }
+        }
+        found
     }
 
-    /// Name and value of everything in a frame. A value is missing when the frame is too short for it.
+    /// What to say about a name that is none: the nearest, and which there are.
+    pub fn unknown(&self, name: &str) -> String {
+        if self.is_empty() {
+            return "the stack gives no names to frames: they come from services of kind can-io and canopen-*"
+                .to_owned();
+        }
+        let mut signals: BTreeSet<&str> = self.signals.values().flatten().map(|s| s.name.as_str()).collect();
+        signals.extend(self.canopen.values().flat_map(|n| n.symbols().map(|(_, symbol)| symbol)));
+        let listed: Vec<&str> = signals.iter().copied().take(MAX_LISTED).collect();
+        let more = match signals.len() - listed.len() {
+            0 => String::new(),
+            n => format!(" and {n} more"),
+        };
+        if self.canopen.is_empty() {
+            return suggestion(name, "names in this stack", listed.iter().copied()) + &more;
+        }
+        let mut nodes: BTreeSet<u8> =
+            self.canopen.values().flat_map(|n| n.nodes.iter().copied()).filter(|n| *n <= 127).collect();
+        let known = nodes.iter().map(u8::to_string).collect::<Vec<_>>().join(", ");
+        nodes.extend(Wanted::parse(name).and_then(|wanted| wanted.node()));
+        let of_nodes: Vec<String> = nodes.into_iter().flat_map(names_of_node).collect();
+        let general = ["NMT", "SYNC", "TIME", "LSS", "EMCY", "SDO", "heartbeat", "TPDO", "RPDO"];
+        let all = signals
+            .iter()
+            .copied()
+            .chain(general)
+            .chain(of_nodes.iter().map(String::as_str))
+            .collect::<Vec<_>>();
+        let near = nearest(name, all).map(|near| format!("did you mean '{near}'?\n")).unwrap_or_default();
+        let listed = if listed.is_empty() { "none".to_owned() } else { listed.join(", ") };
+        format!(
+            "{near}names in this stack: {listed}{more}\nnames of CANopen: NMT, SYNC, TIME, LSS; with a node or without: EMCY 5, TPDO1 5, RPDO1 5, SDO 5, SDO request 5, SDO answer 5, heartbeat 5, node 5; nodes in this stack: {known}"
+        )
+    }
+
+    /// Name and value of everything in a frame. A value is missing when the frame is too short for it, or when the
+    /// name is the frame's own.
     pub fn describe(&self, bus: &str, frame: &CanFrame) -> Vec<(String, Option<String>)> {
         if frame.is_error() {
             return Vec::new();
         }
         let id = frame.id() | (frame.can_id & id_flag::EFF);
+        let value =
+            |s: &Signal| s.codec.filter(|_| !frame.is_remote()).and_then(|c| value_text(&c, frame.payload()));
+        let told =
+            |signals: &[Signal]| signals.iter().map(|s| (s.name.clone(), value(s))).collect::<Vec<_>>();
         if let Some(signals) = self.signals.get(&(id, bus.to_owned())) {
-            let value = |s: &Signal| {
-                s.codec.filter(|_| !frame.is_remote()).and_then(|c| value_text(&c, frame.payload()))
-            };
-            return signals.iter().map(|s| (s.name.clone(), value(s))).collect();
+            return told(signals);
         }
-        if self.canopen.contains(bus) && !frame.is_extended() {
-            return canopen_name(frame.id()).map(|name| (name, None)).into_iter().collect();
-        }
-        Vec::new()
+        let Some((name, signals)) = self.canopen.get(bus).and_then(|network| network.name(id)) else {
+            return Vec::new();
+        };
+        let mut named = vec![(name, None)];
+        named.extend(told(signals));
+        named
+    }
+
+    /// [`Self::describe`] as every command has it in its JSON: an object, name to value or null.
+    pub fn json(&self, bus: &str, frame: &CanFrame) -> serde_json::Value {
+        let named = self.describe(bus, frame).into_iter().map(|(name, value)| (name, value.into()));
+        serde_json::Value::Object(named.collect())
     }
 
     /// [`Self::describe`] in one line.
@@ -132,33 +223,6 @@ fn value_text(codec: &Codec, payload: &[u8]) -> Option<String> {
     })
 }
 
-/// The predefined connection set of CiA 301 (7.3.5): what a COB-ID means unless a device was told otherwise.
-fn canopen_name(id: u32) -> Option<String> {
-    let node = id & 0x7F;
-    let of_node = |what: &str| (node != 0).then(|| format!("{what} {node}"));
-    match id {
-        0 => Some("NMT".to_owned()),
-        0x80 => Some("SYNC".to_owned()),
-        0x100 => Some("TIME".to_owned()),
-        0x7E4 | 0x7E5 => Some("LSS".to_owned()),
-        _ => match id >> 7 {
-            1 => of_node("EMCY"),
-            3 => of_node("TPDO1"),
-            4 => of_node("RPDO1"),
-            5 => of_node("TPDO2"),
-            6 => of_node("RPDO2"),
-            7 => of_node("TPDO3"),
-            8 => of_node("RPDO3"),
-            9 => of_node("TPDO4"),
-            10 => of_node("RPDO4"),
-            11 => of_node("SDO answer"),
-            12 => of_node("SDO request"),
-            14 => of_node("heartbeat"),
-            _ => None,
-        },
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -184,27 +248,99 @@ mod tests {
         assert_eq!(text(&CanFrame::classic(0x18FE_F100, &[1])), "Door=TRUE");
         assert_eq!(text(&CanFrame::classic(0x210, &[8, 7])), "Command=1800");
         assert_eq!(names.text("can1", &CanFrame::classic(0x210, &[8, 7])), "");
-        assert_eq!(names.find("COMMAND"), [("can0".to_owned(), 0x210)]);
-        assert_eq!(names.all(), ["%IB2", "Command", "Door", "Speed"]);
+        assert_eq!(names.find("COMMAND"), Ids::from([("can0".to_owned(), BTreeSet::from([0x210]))]));
+        assert_eq!(names.unknown("x"), "names in this stack: %IB2, Command, Door, Speed");
+    }
+
+    /// A stack's worth: `can-io` and a CANopen network on the same bus.
+    fn mixed() -> Names {
+        let mut names = Names::of_table(&[("can0", 0x1A0, "Speed"), ("can1", 0x8000_0001, "Level")]);
+        let config: MasterConfig = serde_json::from_value(json!({
+            "node": [{ "id": 5, "eds": "io401.eds", "map": [
+                { "object": "6000:01", "to": "%IB0", "symbol": "Buttons" },
+                { "object": "6401:01", "to": "%IW2", "symbol": "Pressure" },
+            ] }],
+        }))
+        .unwrap();
+        let dir = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("stacks/canopen-io");
+        names.canopen.entry("can0".to_owned()).or_default().add_master(&config, &dir);
+        names
     }
 
     #[test]
-    fn canopen_names() {
-        let table = [
-            (0, "NMT"),
-            (0x80, "SYNC"),
-            (0x85, "EMCY 5"),
-            (0x185, "TPDO1 5"),
-            (0x57F, "RPDO4 127"),
-            (0x581, "SDO answer 1"),
-            (0x601, "SDO request 1"),
-            (0x705, "heartbeat 5"),
-            (0x7E5, "LSS"),
-        ];
-        for (id, name) in table {
-            assert_eq!(canopen_name(id).as_deref(), Some(name));
+    fn canopen_frames_have_their_objects_with_values() {
+        let names = mixed();
+        assert_eq!(names.text("can0", &CanFrame::classic(0x185, &[7])), "TPDO1 5 Buttons=7");
+        assert_eq!(names.text("can0", &CanFrame::classic(0x285, &[0xFE, 0xFF])), "TPDO2 5 Pressure=-2");
+        assert_eq!(names.text("can0", &CanFrame::classic(0x285, &[])), "TPDO2 5 Pressure");
+        assert_eq!(names.text("can0", &CanFrame::classic(0x586, &[])), "SDO answer 6");
+        // A signal of can-io says more than the predefined connection set.
+        assert_eq!(names.text("can0", &CanFrame::classic(0x1A0, &[])), "Speed");
+        assert_eq!(names.text("can1", &CanFrame::classic(0x185, &[7])), "");
+        assert_eq!(
+            names.json("can0", &CanFrame::classic(0x185, &[7])),
+            json!({ "TPDO1 5": null, "Buttons": "7" })
+        );
+        assert_eq!(names.json("can0", &CanFrame::classic(0x7FF, &[])), json!({}));
+    }
+
+    #[test]
+    fn what_is_shown_is_found() {
+        let names = mixed();
+        let found = |text: &str| {
+            let ids = names.find(text);
+            let text = |(bus, ids): (&String, &BTreeSet<u32>)| match ids.len() {
+                0..=4 => format!("{bus} {ids:X?}"),
+                n => format!("{bus} {n} identifiers"),
+            };
+            ids.iter().map(text).collect::<Vec<_>>().join(", ")
+        };
+        for (typed, ids) in [
+            ("speed", "can0 {1A0}"),
+            ("Level", "can1 {80000001}"),
+            ("Buttons", "can0 {185}"),
+            ("TPDO1 5", "can0 {185}"),
+            ("sdo node 5", "can0 {585, 605}"),
+            ("SDO request 5", "can0 {605}"),
+            ("heartbeat 5", "can0 {705}"),
+            ("heartbeat", "can0 127 identifiers"),
+            ("SYNC", "can0 {80}"),
+            ("node 5", "can0 12 identifiers"),
+            // 1A0 is named Speed, not TPDO1 32.
+            ("TPDO1 32", ""),
+            ("heartbeet 5", ""),
+        ] {
+            assert_eq!(found(typed), ids, "{typed}");
         }
-        assert_eq!(canopen_name(0x700), None);
-        assert_eq!(canopen_name(0x680), None);
+        // Whatever is shown can be filtered by.
+        for id in (0..0x800).step_by(31).chain([0x80, 0x185, 0x285, 0x705, 0x7E5]) {
+            let frame = CanFrame::classic(id, &[]);
+            for (name, _) in names.describe("can0", &frame) {
+                assert!(names.find(&name)["can0"].contains(&id), "{name}");
+            }
+        }
+    }
+
+    #[test]
+    fn unknown_names_bring_the_nearest() {
+        let names = mixed();
+        let said: Vec<String> = ["Presure", "heartbeet 5", "TPDO1 nod 7", "xyzzy"]
+            .iter()
+            .map(|name| names.unknown(name).lines().next().unwrap_or_default().to_owned())
+            .collect();
+        insta::assert_snapshot!(said.join("\n"), @r#"
+did you mean 'Pressure'?
+did you mean 'heartbeat 5'?
+did you mean 'TPDO'?
+names in this stack: Buttons, Level, Pressure, Speed
+"#);
+        insta::assert_snapshot!(names.unknown("xyzzy"), @r#"
+names in this stack: Buttons, Level, Pressure, Speed
+names of CANopen: NMT, SYNC, TIME, LSS; with a node or without: EMCY 5, TPDO1 5, RPDO1 5, SDO 5, SDO request 5, SDO answer 5, heartbeat 5, node 5; nodes in this stack: 1, 5
+"#);
+        assert!(Names::default().unknown("x").starts_with("the stack gives no names to frames"));
+        let many: Vec<String> = (0..=MAX_LISTED).map(|i| format!("Signal{i}")).collect();
+        let many: Vec<(&str, u32, &str)> = many.iter().map(|name| ("can0", 1, name.as_str())).collect();
+        assert!(Names::of_table(&many).unknown("x").ends_with(" and 1 more"));
     }
 }

@@ -12,6 +12,7 @@ use crate::stackfile::nearest;
 use ipc_types::payload::{CanFrame, can_flag};
 use ipc_types::reactor::{Reactor, Wake};
 use std::collections::BTreeMap;
+use std::path::Path;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
@@ -33,6 +34,7 @@ pub fn run(args: &ReplayArgs, json: bool) -> anyhow::Result<ExitCode> {
     let mut ctx = super::join(args.which.stack.as_deref())?;
     let names = Names::of(&ctx.stack);
     let filter = Filter::parse(&args.filter.filter, &names)?;
+    direction_is_told(args, &contents, &filter)?;
     let targets = targets(&contents, &super::all_buses(&ctx), args.bus.as_deref(), &args.map)?;
     let mut senders: Vec<(String, Sender)> = Vec::new();
     for bus in targets.values() {
@@ -66,6 +68,24 @@ pub fn run(args: &ReplayArgs, json: bool) -> anyhow::Result<ExitCode> {
         }
     }
     Ok(player.report(begin.elapsed(), why.as_deref(), json))
+}
+
+/// Refuses to tell sent frames from received ones where the file does not.
+fn direction_is_told(args: &ReplayArgs, contents: &Contents, filter: &Filter) -> Result<(), UsageError> {
+    let asked = match () {
+        () if args.received_only => "--received-only",
+        () if filter.asks_direction() => "--filter #tx or #rx",
+        () => return Ok(()),
+    };
+    if contents.undirected == 0 {
+        return Ok(());
+    }
+    Err(UsageError(format!(
+        "{} does not tell sent frames from received ones ({} of its {} frames have no direction), so {asked} cannot be applied: recordings of a stack and ASC files tell it, and candump logs made by `dinrail can dump --direction` or `candump -x`",
+        args.file.display(),
+        contents.undirected,
+        contents.frames
+    )))
 }
 
 /// Where the frames of each logged bus go.
@@ -129,6 +149,12 @@ struct Clock {
     speed: Option<f64>,
     /// From the start of one round to that of the next, in ns of the log.
     round_ns: u64,
+    /// Longer pauses are cut to this.
+    max_gap_ns: u64,
+    /// Cut so far.
+    cut_ns: u64,
+    /// Round and place of the frame before.
+    before: (u64, u64),
     last: Duration,
 }
 
@@ -145,6 +171,9 @@ impl Clock {
             to_ns,
             speed: (!args.no_wait).then_some(args.speed),
             round_ns: round_ns.max(LEAST_ROUND.as_nanos() as u64),
+            max_gap_ns: args.max_gap.map_or(u64::MAX, |gap| gap.ns()),
+            cut_ns: 0,
+            before: (0, from_ns),
             last: Duration::ZERO,
         }
     }
@@ -156,7 +185,13 @@ impl Clock {
             return None;
         }
         let Some(speed) = self.speed else { return Some(Duration::ZERO) };
-        let ns = (round as f64 * self.round_ns as f64 + (since_ns - self.from_ns) as f64) / speed;
+        // The pause behind the last frame of a round is one like any other.
+        let place = if round == self.before.0 { self.before.1 } else { self.from_ns };
+        self.cut_ns += since_ns.saturating_sub(place).saturating_sub(self.max_gap_ns);
+        self.before = (round, place.max(since_ns));
+        let ns = (round as f64 * self.round_ns as f64 + (since_ns - self.from_ns) as f64
+            - self.cut_ns as f64)
+            / speed;
         self.last = self.last.max(Duration::from_nanos(ns as u64));
         Some(self.last)
     }
@@ -268,11 +303,19 @@ impl Player<'_> {
     fn report(&self, took: Duration, why: Option<&str>, json: bool) -> ExitCode {
         let each: Vec<(&str, Counts)> =
             self.senders.iter().map(|(bus, s)| (bus.as_str(), s.counts())).collect();
-        let whole = why.is_none() && each.iter().all(|(_, c)| c.echoed == c.sent && c.out_of_order == 0);
+        let result = Outcome::of(why.is_some(), each.iter().map(|(_, counts)| counts));
         if json {
-            let buses: BTreeMap<&str, Counts> = each.iter().copied().collect();
+            let buses: BTreeMap<&str, serde_json::Value> = self
+                .senders
+                .iter()
+                .map(|(bus, sender)| {
+                    let mut value = serde_json::to_value(sender.counts()).unwrap_or_default();
+                    value["others"] = sender.others().into();
+                    (bus.as_str(), value)
+                })
+                .collect();
             let value = serde_json::json!({
-                "file": self.args.file, "seconds": took.as_secs_f64(), "whole": whole,
+                "file": self.args.file, "seconds": took.as_secs_f64(), "whole": result == Outcome::Whole,
                 "buses": buses, "left_out": self.left_out,
             });
             super::put(&format!("{value}\n"));
@@ -287,26 +330,75 @@ impl Player<'_> {
                 ));
             }
         }
+        for remark in self.senders.iter().flat_map(|(_, sender)| sender.remarks()) {
+            eprintln!("dinrail: {remark}");
+        }
         if let Some(why) = why {
             eprintln!("dinrail: {why}");
+        } else if result == Outcome::Nothing {
+            eprintln!("dinrail: {}", nothing(&self.args.file, self.left_out));
         }
+        result.exit_code()
+    }
+}
+
+/// How it ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Outcome {
+    /// Every frame sent was seen, in order; frames of others do not count.
+    Whole,
+    /// No frame was sent, or none was seen.
+    Nothing,
+    Part,
+}
+
+impl Outcome {
+    fn of<'a>(stalled: bool, each: impl Iterator<Item = &'a Counts> + Clone) -> Self {
+        let good = |c: &Counts| c.echoed == c.sent && c.out_of_order == 0;
         match () {
-            () if whole => ExitCode::SUCCESS,
-            () if each.iter().all(|(_, c)| c.echoed == 0) => ExitCode::FAILURE,
-            () => ExitCode::from(DATA_LOSS),
+            () if each.clone().all(|c| c.echoed == 0) => Self::Nothing,
+            () if !stalled && each.clone().all(good) => Self::Whole,
+            () => Self::Part,
         }
     }
+
+    fn exit_code(self) -> ExitCode {
+        match self {
+            Self::Whole => ExitCode::SUCCESS,
+            Self::Nothing => ExitCode::FAILURE,
+            Self::Part => ExitCode::from(DATA_LOSS),
+        }
+    }
+}
+
+/// Why nothing was sent.
+fn nothing(file: &Path, left_out: LeftOut) -> String {
+    let LeftOut { error_frames, not_wanted } = left_out;
+    let why = match (not_wanted, error_frames) {
+        (0, 0) => "ended before the first frame was due".to_owned(),
+        (0, _) => format!("{} holds error frames only, and nobody can send one", file.display()),
+        (_, 0) => "every frame was left out by --filter, --map, --from, --to or --received-only".to_owned(),
+        _ => "every frame was left out: by --filter, --map, --from, --to or --received-only, or because it is an error frame".to_owned(),
+    };
+    format!("nothing was sent: {why}")
 }
 
 fn text(bus: &str, counts: &Counts, seconds: f64) -> String {
     let rate = counts.sent as f64 / seconds.max(1e-9);
     let missing = counts.sent.saturating_sub(counts.echoed);
+    if counts.sent == 0 {
+        return format!("{bus}: no frame sent");
+    }
     let echo = match (missing, counts.out_of_order) {
         (0, 0) => "every one was seen on the bus, in order".to_owned(),
         (0, n) => format!("every one was seen on the bus, {n} out of order"),
         (missing, n) => format!("{missing} were not seen on the bus, {n} out of order"),
     };
-    format!("{bus}: {} frames sent in {seconds:.3} s ({rate:.0}/s); {echo}", counts.sent)
+    let others = match counts.equal_from_others {
+        0 => String::new(),
+        n => format!("; {n} equal ones came from others"),
+    };
+    format!("{bus}: {} frames sent in {seconds:.3} s ({rate:.0}/s); {echo}{others}", counts.sent)
 }
 
 #[cfg(test)]
@@ -322,6 +414,7 @@ mod tests {
             order: buses.iter().map(|b| (*b).to_owned()).collect(),
             frames: 10,
             errors: 0,
+            undirected: 0,
             first_ns: 1_000,
             last_ns: 10_000_001_000,
         }
@@ -384,6 +477,73 @@ the stack has no CAN bus 'x'; it has can0
     }
 
     #[test]
+    fn long_pauses_are_cut() {
+        let mut cut = clock("--max-gap 1s --loop 2");
+        let due = |clock: &mut Clock, round, ms: u64| {
+            clock.due(round, 1_000 + ms * 1_000_000).map(|due| due.as_millis() as u64)
+        };
+        for (round, ms, expected) in [
+            (0, 0, 0),
+            (0, 500, 500),
+            (0, 4_500, 1_500),
+            // Not in order: nothing to cut.
+            (0, 4_000, 1_500),
+            (0, 4_600, 1_600),
+            (0, 10_000, 2_600),
+            // Eleven seconds of the log lie between the rounds, 3 + 4.4 were cut.
+            (1, 0, 3_600),
+            (1, 500, 4_100),
+            (1, 4_500, 5_100),
+        ] {
+            assert_eq!(due(&mut cut, round, ms), Some(expected), "{round} {ms}");
+        }
+        let mut fast = clock("--max-gap 1s --speed 2 --from 4s");
+        assert_eq!((due(&mut fast, 0, 4_000), due(&mut fast, 0, 8_000)), (Some(0), Some(500)));
+    }
+
+    #[test]
+    fn how_it_ends() {
+        let whole = Counts { sent: 5, echoed: 5, equal_from_others: 3, ..Counts::default() };
+        let swapped = Counts { out_of_order: 1, ..whole };
+        let unseen = Counts { sent: 5, ..Counts::default() };
+        let of = |stalled, each: &[Counts]| Outcome::of(stalled, each.iter());
+        assert_eq!(of(false, &[whole]), Outcome::Whole);
+        assert_eq!(of(false, &[whole, Counts::default()]), Outcome::Whole);
+        assert_eq!(of(true, &[whole]), Outcome::Part);
+        assert_eq!(of(false, &[whole, swapped]), Outcome::Part);
+        assert_eq!(of(true, &[unseen]), Outcome::Nothing);
+        assert_eq!(of(false, &[Counts::default()]), Outcome::Nothing);
+        assert_eq!(Outcome::Nothing.exit_code(), ExitCode::FAILURE);
+        let said = [(0, 0), (0, 2), (3, 0), (3, 2)].map(|(not_wanted, error_frames)| {
+            nothing(Path::new("a.log"), LeftOut { error_frames, not_wanted })
+        });
+        insta::assert_snapshot!(said.join("\n"), @r#"
+nothing was sent: ended before the first frame was due
+nothing was sent: a.log holds error frames only, and nobody can send one
+nothing was sent: every frame was left out by --filter, --map, --from, --to or --received-only
+nothing was sent: every frame was left out: by --filter, --map, --from, --to or --received-only, or because it is an error frame
+"#);
+    }
+
+    #[test]
+    fn direction_is_not_invented() {
+        let said = |words: &str, undirected| {
+            let words = ["dinrail", "can", "replay", "x.log"].into_iter().chain(words.split_whitespace());
+            let Command::Can(CanCommand::Replay(args)) = Cli::try_parse_from(words).unwrap().command else {
+                panic!()
+            };
+            let filter = Filter::parse(&args.filter.filter, &Names::default()).unwrap();
+            let contents = Contents { undirected, ..contents(&["a"]) };
+            direction_is_told(&args, &contents, &filter).map_err(|e| e.to_string())
+        };
+        assert_eq!(said("", 10), Ok(()));
+        assert_eq!(said("--received-only", 0), Ok(()));
+        let error = said("--received-only", 10).unwrap_err();
+        assert!(error.starts_with("x.log does not tell sent frames from received ones (10 of its 10 frames have no direction), so --received-only"), "{error}");
+        assert!(said("--filter !#tx", 1).unwrap_err().contains("--filter #tx or #rx cannot be applied"));
+    }
+
+    #[test]
     fn summary() {
         let counts = Counts { sent: 100, echoed: 100, ..Counts::default() };
         assert_eq!(
@@ -392,5 +552,8 @@ the stack has no CAN bus 'x'; it has can0
         );
         let lost = Counts { echoed: 98, out_of_order: 1, ..counts };
         assert!(text("can0", &lost, 2.0).ends_with("2 were not seen on the bus, 1 out of order"));
+        let shared = Counts { equal_from_others: 7, ..counts };
+        assert!(text("can0", &shared, 2.0).ends_with("on the bus, in order; 7 equal ones came from others"));
+        assert_eq!(text("can0", &Counts::default(), 2.0), "can0: no frame sent");
     }
 }

@@ -1,7 +1,7 @@
 //! Sending on a bus of a running stack without loss: what the driver refuses is offered again, and every frame is
 //! followed until it was on the bus.
 
-use super::flight::{Flight, Order};
+use super::flight::{Flight, Order, Sight};
 use super::{place, topic};
 use dinrail_can::protocol::candump;
 use ipc_types::Context;
@@ -14,6 +14,11 @@ use std::time::{Duration, Instant};
 /// A frame must be seen on the bus, or the driver take one, within this time. Longer than the 2 s after which a driver
 /// throws away what could not be sent.
 const PATIENCE: Duration = Duration::from_secs(3);
+/// An equal frame was seen before its turn: so long the real one is awaited. The second is for a driver that has shown
+/// that it keeps another order.
+const TURN: [Duration; 2] = [Duration::from_secs(1), Duration::from_millis(20)];
+/// Others sent equal frames: the last of ours may still be on its way.
+const LINGER: Duration = Duration::from_millis(50);
 /// Frames taken at one look.
 const BATCH: usize = 4096;
 
@@ -28,6 +33,8 @@ pub struct Counts {
     pub echoed: u64,
     /// Seen before one that was given earlier.
     pub out_of_order: u64,
+    /// Equal to these, but sent by somebody else of the stack meanwhile.
+    pub equal_from_others: u64,
     /// Frames of the bus that were replaced before they were read: echoes may be among them.
     pub unseen: u64,
 }
@@ -35,6 +42,8 @@ pub struct Counts {
 /// See the module.
 pub struct Sender {
     bus: String,
+    /// Services of the stack that may send on the bus, too.
+    others: Vec<String>,
     rx: Subscriber<CanFrame>,
     tx: Publisher<CanFrame>,
     flight: Flight,
@@ -50,6 +59,8 @@ pub struct Sender {
 
 impl Sender {
     pub fn new(ctx: &mut Context, bus: &str, order: Order) -> anyhow::Result<Self> {
+        let others =
+            ctx.stack.topic(&TopicKind::CanTx.of(bus)).map(|t| t.writers.clone()).unwrap_or_default();
         let (rx, tx) = (topic(ctx, bus, TopicKind::CanRx)?, topic(ctx, bus, TopicKind::CanTx)?);
         let rx = place(ctx, ctx.subscriber::<CanFrame>(&rx))?;
         let tx = ctx.publisher::<CanFrame>(&tx);
@@ -58,6 +69,7 @@ impl Sender {
         let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(1000));
         Ok(Self {
             bus: bus.to_owned(),
+            others,
             rx,
             tx,
             flight: Flight::new(order),
@@ -106,11 +118,16 @@ impl Sender {
         }
         let (flight, mut any) = (&mut self.flight, false);
         self.rx.drain(BATCH, |seen, _| {
-            if seen.flags & can_flag::TX_ECHO != 0 && flight.seen(seen) {
+            if seen.flags & can_flag::TX_ECHO != 0 && flight.seen(seen) == Sight::Ours {
                 any = true;
                 each(seen);
             }
         });
+        let turn = TURN[usize::from(self.flight.out_of_order() > 0)];
+        if !any && self.flight.is_early() && self.progress.elapsed() > turn {
+            self.flight.accept_early();
+            any = true;
+        }
         if any {
             self.progress = Instant::now();
         }
@@ -165,8 +182,38 @@ impl Sender {
             refused: self.refused,
             echoed: self.flight.echoed(),
             out_of_order: self.flight.out_of_order(),
+            equal_from_others: self.flight.equal(),
             unseen: self.rx.counters().lost,
         }
+    }
+
+    /// What there is to say about the order and about others; a sentence each.
+    pub fn remarks(&self) -> Vec<String> {
+        let mut remarks = Vec::new();
+        let Counts { out_of_order, equal_from_others, .. } = self.counts();
+        if let Some(first) = self.flight.first_out_of_order() {
+            remarks.push(format!(
+                "bus '{}': {out_of_order} frames were seen before one that was given earlier, and not again in their turn; the first is {}",
+                self.bus,
+                candump::format(first)
+            ));
+        }
+        if equal_from_others > 0 {
+            let who = match self.others.as_slice() {
+                [] => "another tool, because no service of the stack sends there".to_owned(),
+                others => format!("{} or another tool", others.join(", ")),
+            };
+            remarks.push(format!(
+                "bus '{}': {equal_from_others} frames equal to these came from another sender of the stack ({who}; echoes do not name their sender)",
+                self.bus
+            ));
+        }
+        remarks
+    }
+
+    /// Services of the stack that may send on the bus, too.
+    pub fn others(&self) -> &[String] {
+        &self.others
     }
 
     /// Waits until everything sent was seen; otherwise says why that took too long.
@@ -177,6 +224,10 @@ impl Sender {
                 return Some(why);
             }
             self.rest(busy);
+        }
+        if self.flight.equal() > 0 {
+            std::thread::sleep(LINGER);
+            self.look();
         }
         None
     }

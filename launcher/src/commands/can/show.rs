@@ -61,6 +61,8 @@ pub enum Time {
     Absolute,
     /// Since the frame before.
     Delta,
+    /// Since the first frame.
+    Start,
 }
 
 /// Makes lines.
@@ -72,6 +74,8 @@ pub struct Printer<'a> {
     pub names: Option<&'a Names>,
     /// Width of the column of buses; 0 leaves it out.
     pub bus_width: usize,
+    /// Who sent it, in a log line.
+    pub direction: bool,
     last_ns: Option<u64>,
 }
 
@@ -84,14 +88,14 @@ impl<'a> Printer<'a> {
         names: Option<&'a Names>,
         bus_width: usize,
     ) -> Self {
-        Self { form, time, ascii, paint, names, bus_width, last_ns: None }
+        Self { form, time, ascii, paint, names, bus_width, direction: false, last_ns: None }
     }
 
     /// One line, without its end.
     pub fn line(&mut self, bus: &str, message: &CanFrame, utc_ns: u64) -> String {
         match self.form {
             Form::Screen => self.screen(bus, message, utc_ns),
-            Form::Log => candump::format_log_line(utc_ns, bus, &to_frame(message)),
+            Form::Log => log_line(utc_ns, bus, message, self.direction),
             Form::Json => self.json(bus, message, utc_ns),
         }
     }
@@ -141,6 +145,10 @@ impl<'a> Printer<'a> {
                 let us = utc_ns.saturating_sub(before) / 1000;
                 format!("(+{:>4}.{:06})", us / 1_000_000, us % 1_000_000)
             }
+            Time::Start => {
+                let us = utc_ns.saturating_sub(*self.last_ns.get_or_insert(utc_ns)) / 1000;
+                format!("({:>6}.{:06})", us / 1_000_000, us % 1_000_000)
+            }
             Time::Day => {
                 let of_day = seconds % 86_400;
                 format!("{:02}:{:02}:{:02}.{us:06}", of_day / 3600, of_day / 60 % 60, of_day % 60)
@@ -149,26 +157,39 @@ impl<'a> Printer<'a> {
     }
 
     fn json(&self, bus: &str, message: &CanFrame, utc_ns: u64) -> String {
-        let frame = to_frame(message);
-        let mut line = serde_json::json!({
-            "bus": bus, "seq": message.stamp.seq, "utc_ns": utc_ns,
-            "utc": Utc::from_ns(utc_ns as i64).iso(), "frame": candump::format(&frame),
-            "id": message.id(), "extended": message.is_extended(), "len": message.len,
-            "data": hex(message.payload()),
-            "echo": message.flags & can_flag::TX_ECHO != 0,
-            "rtr": message.is_remote() && !message.is_error(), "fd": message.is_fd(),
-            "brs": message.fd_flags & fd_flag::BRS != 0, "esi": message.fd_flags & fd_flag::ESI != 0,
-        });
-        if let Some(error) = ErrorFrame::of(&frame) {
-            line["error"] = error.words().into();
-        }
-        let named = self.names.map(|n| n.describe(bus, message)).unwrap_or_default();
-        if !named.is_empty() {
-            let entries = named.into_iter().map(|(name, value)| (name, value.into()));
-            line["names"] = serde_json::Value::Object(entries.collect());
-        }
+        let mut line = as_json(bus, message, self.names);
+        line["seq"] = message.stamp.seq.into();
+        line["utc_ns"] = utc_ns.into();
+        line["utc"] = Utc::from_ns(utc_ns as i64).iso().into();
         line.to_string()
     }
+}
+
+/// `candump -L`, with `direction` as `candump -x` has it.
+pub fn log_line(utc_ns: u64, bus: &str, message: &CanFrame, direction: bool) -> String {
+    let line = candump::format_log_line(utc_ns, bus, &to_frame(message));
+    match (direction, message.flags & can_flag::TX_ECHO != 0) {
+        (false, _) => line,
+        (true, true) => line + " T",
+        (true, false) => line + " R",
+    }
+}
+
+/// A frame in the one shape that all commands have.
+pub fn as_json(bus: &str, message: &CanFrame, names: Option<&Names>) -> serde_json::Value {
+    let frame = to_frame(message);
+    let mut value = serde_json::json!({
+        "bus": bus, "frame": candump::format(&frame), "id": message.id(), "id_text": id_text(message),
+        "extended": message.is_extended(), "len": message.len, "data": hex(message.payload()),
+        "echo": message.flags & can_flag::TX_ECHO != 0,
+        "rtr": message.is_remote() && !message.is_error(), "fd": message.is_fd(),
+        "brs": message.fd_flags & fd_flag::BRS != 0, "esi": message.fd_flags & fd_flag::ESI != 0,
+        "names": names.map_or_else(|| serde_json::json!({}), |names| names.json(bus, message)),
+    });
+    if let Some(error) = ErrorFrame::of(&frame) {
+        value["error"] = error.words().into();
+    }
+    value
 }
 
 /// `FD BRS ESI`, `RTR`.
@@ -255,6 +276,10 @@ mod tests {
 (+   0.001500)  can0            7FF  [ 0]
 (+   0.001500)  can0          ERROR  bus-off
 "#);
+        insta::assert_snapshot!(lines(Form::Screen, Time::Start, false, Paint::PLAIN).lines().take(2).collect::<Vec<_>>().join("\n"), @r#"
+(     0.000000)  can0            1A0  [ 6]  B0 04 46 6F 6F 0D        Speed Torque
+(     0.001500)  can0   TX  18FEF100  [ 1]  01
+"#);
         insta::assert_snapshot!(lines(Form::Screen, Time::Absolute, false, Paint::COLOR).replace('\x1b', "ESC"), @r#"
 ESC[2m(1506783973.191777)ESC[0m  can0   ESC[36m  ESC[0m       1A0  [ 6]  B0 04 46 6F 6F 0D        ESC[32mSpeed TorqueESC[0m
 ESC[2m(1506783973.193277)ESC[0m  can0   ESC[36mTXESC[0m  18FEF100  [ 1]  01
@@ -276,13 +301,20 @@ ESC[2m(1506783973.199277)ESC[0m  can0   ESC[36m  ESC[0m  ESC[31m   ERROR  bus-of
 (1506783973.199277) can0 20000040#0000000000000000
 "#);
         insta::assert_snapshot!(lines(Form::Json, Time::Day, true, Paint::COLOR), @r#"
-{"brs":false,"bus":"can0","data":"B004466F6F0D","echo":false,"esi":false,"extended":false,"fd":false,"frame":"1A0#B004466F6F0D","id":416,"len":6,"names":{"Speed":null,"Torque":null},"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.191777Z","utc_ns":1506783973191777888}
-{"brs":false,"bus":"can0","data":"01","echo":true,"esi":false,"extended":true,"fd":false,"frame":"18FEF100#01","id":419361024,"len":1,"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.193277Z","utc_ns":1506783973193277888}
-{"brs":false,"bus":"can0","data":"","echo":false,"esi":false,"extended":false,"fd":false,"frame":"123#R4","id":291,"len":4,"rtr":true,"seq":0,"utc":"2017-09-30T15:06:13.194777Z","utc_ns":1506783973194777888}
-{"brs":true,"bus":"can0","data":"AABB","echo":false,"esi":true,"extended":false,"fd":true,"frame":"123##3AABB","id":291,"len":2,"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.196277Z","utc_ns":1506783973196277888}
-{"brs":false,"bus":"can0","data":"","echo":false,"esi":false,"extended":false,"fd":false,"frame":"7FF#","id":2047,"len":0,"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.197777Z","utc_ns":1506783973197777888}
-{"brs":false,"bus":"can0","data":"0000000000000000","echo":false,"error":"bus-off","esi":false,"extended":false,"fd":false,"frame":"20000040#0000000000000000","id":64,"len":8,"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.199277Z","utc_ns":1506783973199277888}
+{"brs":false,"bus":"can0","data":"B004466F6F0D","echo":false,"esi":false,"extended":false,"fd":false,"frame":"1A0#B004466F6F0D","id":416,"id_text":"1A0","len":6,"names":{"Speed":null,"Torque":null},"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.191777Z","utc_ns":1506783973191777888}
+{"brs":false,"bus":"can0","data":"01","echo":true,"esi":false,"extended":true,"fd":false,"frame":"18FEF100#01","id":419361024,"id_text":"18FEF100","len":1,"names":{},"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.193277Z","utc_ns":1506783973193277888}
+{"brs":false,"bus":"can0","data":"","echo":false,"esi":false,"extended":false,"fd":false,"frame":"123#R4","id":291,"id_text":"123","len":4,"names":{},"rtr":true,"seq":0,"utc":"2017-09-30T15:06:13.194777Z","utc_ns":1506783973194777888}
+{"brs":true,"bus":"can0","data":"AABB","echo":false,"esi":true,"extended":false,"fd":true,"frame":"123##3AABB","id":291,"id_text":"123","len":2,"names":{},"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.196277Z","utc_ns":1506783973196277888}
+{"brs":false,"bus":"can0","data":"","echo":false,"esi":false,"extended":false,"fd":false,"frame":"7FF#","id":2047,"id_text":"7FF","len":0,"names":{},"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.197777Z","utc_ns":1506783973197777888}
+{"brs":false,"bus":"can0","data":"0000000000000000","echo":false,"error":"bus-off","esi":false,"extended":false,"fd":false,"frame":"20000040#0000000000000000","id":64,"id_text":"040","len":8,"names":{},"rtr":false,"seq":0,"utc":"2017-09-30T15:06:13.199277Z","utc_ns":1506783973199277888}
 "#);
+    }
+
+    #[test]
+    fn who_sent_a_frame() {
+        let frames = frames();
+        assert_eq!(log_line(UTC, "can0", &frames[0], true), "(1506783973.191777) can0 1A0#B004466F6F0D R");
+        assert_eq!(log_line(UTC, "can0", &frames[1], true), "(1506783973.191777) can0 18FEF100#01 T");
     }
 
     #[test]

@@ -153,7 +153,7 @@ pub fn run(args: &SniffArgs, json: bool) -> anyhow::Result<ExitCode> {
     let ctx = super::join(args.which.stack.as_deref())?;
     let names = Names::of(&ctx.stack);
     let filter = Filter::parse(&args.filter.filter, &names)?;
-    let bus = super::buses(&ctx, std::slice::from_ref(&args.bus))?.swap_remove(0);
+    let bus = super::one_bus(&ctx, args.bus.as_deref())?;
     let mut listener = Listener::new(&ctx, vec![bus.clone()])?;
     let mut reactor = Reactor::new()?;
     reactor.add_timer(LOOK)?;
@@ -171,7 +171,7 @@ pub fn run(args: &SniffArgs, json: bool) -> anyhow::Result<ExitCode> {
             if filter.takes(&bus, message) {
                 let news = sniffer.take(&bus, message, &names);
                 if page.is_none() && news != News::Same {
-                    text += &news_line(&sniffer, &bus, message, &news, &paint, json);
+                    text += &news_line(&sniffer, &bus, message, &news, &paint, json.then_some(&names));
                     text.push('\n');
                 }
             }
@@ -199,18 +199,18 @@ fn news_line(
     frame: &CanFrame,
     news: &News,
     paint: &Paint,
-    json: bool,
+    json: Option<&Names>,
 ) -> String {
     let Some(row) = sniffer.rows.get(&(frame.is_extended(), frame.id())) else { return String::new() };
     let none = Vec::new();
     let changed = if let News::Changed(changed) = news { changed } else { &none };
-    if json {
-        return serde_json::json!({
-            "bus": bus, "id": frame.id(), "id_text": id_text(frame), "extended": frame.is_extended(),
-            "data": super::show::spaced(frame.payload()), "changed": changed, "first": *news == News::First,
-            "period_ms": row.period_ns.map(|ns| ns as f64 / 1e6), "frames": row.frames, "names": row.names,
-        })
-        .to_string();
+    if let Some(names) = json {
+        let mut value = super::show::as_json(bus, frame, Some(names));
+        value["changed"] = changed.as_slice().into();
+        value["first"] = (*news == News::First).into();
+        value["period_ms"] = row.period_ns.map(|ns| ns as f64 / 1e6).into();
+        value["frames"] = row.frames.into();
+        return value.to_string();
     }
     Sniffer::line(row, paint, |i| changed.contains(&i))
 }
@@ -225,7 +225,7 @@ mod tests {
     fn what_changes_stands_out() {
         let names = Names::of_table(&[("can0", 0x123, "Speed")]);
         let mut sniffer = Sniffer::default();
-        let mut lines = Vec::new();
+        let (mut lines, mut json) = (Vec::new(), Vec::new());
         for (ms, text) in [
             (1000, "123#4100FF"),
             (1010, "123#4100FF"),
@@ -239,7 +239,8 @@ mod tests {
             let frame = CanFrame { stamp, ..super::super::from_frame(&parse(text).unwrap()) };
             let news = sniffer.take("can0", &frame, &names);
             if news != News::Same {
-                lines.push(news_line(&sniffer, "can0", &frame, &news, &Paint::PLAIN, false));
+                lines.push(news_line(&sniffer, "can0", &frame, &news, &Paint::PLAIN, None));
+                json.push(news_line(&sniffer, "can0", &frame, &news, &Paint::PLAIN, Some(&names)));
             }
         }
         insta::assert_snapshot!(lines.join("\n"), @r#"
@@ -248,6 +249,10 @@ mod tests {
      -  00000123  [ 2]  RTR
 20.000       123  [ 1]  41                       A  Speed
 10.000       123  [12]  FD BRS 41 42*43*44*45*46*47*48*49*4A*4B*4C* ABCDEFGHIJKL  Speed
+"#);
+        insta::assert_snapshot!(json[..2].join("\n"), @r#"
+{"brs":false,"bus":"can0","changed":[],"data":"4100FF","echo":false,"esi":false,"extended":false,"fd":false,"first":true,"frame":"123#4100FF","frames":1,"id":291,"id_text":"123","len":3,"names":{"Speed":null},"period_ms":null,"rtr":false}
+{"brs":false,"bus":"can0","changed":[1,2],"data":"4101FE","echo":false,"esi":false,"extended":false,"fd":false,"first":false,"frame":"123#4101FE","frames":3,"id":291,"id_text":"123","len":3,"names":{"Speed":null},"period_ms":10.0,"rtr":false}
 "#);
         insta::assert_snapshot!(sniffer.page("can0", &Paint::COLOR, 1_100_000_000).join("\n").replace('\x1b', "ESC"), @r#"
 can0: 2 identifiers, 6 frames; Ctrl-C ends

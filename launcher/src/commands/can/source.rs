@@ -4,6 +4,7 @@ use super::merge::Merge;
 use dinrail_can::protocol::frame::Frame;
 use dinrail_can::protocol::logfile::{self, Format, Reader};
 use dinrail_recorder::Recording;
+use dinrail_recorder::format::META_RECORDING;
 use dinrail_recorder::reader::Item;
 use ipc_types::payload::{CanFrame, can_flag, from_bytes};
 use ipc_types::topic::TopicKind;
@@ -16,6 +17,9 @@ use std::path::{Path, PathBuf};
 const MCAP_MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 /// Topics of a recording are written in batches: a frame of one bus may stand so much behind a later one of another.
 const HOLD_NS: u64 = 2_000_000_000;
+/// Key of a recording's metadata, and its value where frames do not tell who sent them.
+pub const DIRECTION: &str = "direction";
+pub const DIRECTION_UNKNOWN: &str = "unknown";
 /// Most buses of a file.
 pub const MAX_BUSES: usize = 256;
 
@@ -28,6 +32,8 @@ pub struct Logged {
     pub frame: Frame,
     /// Sent by the one who logged.
     pub tx: bool,
+    /// Whether the file tells that; if not, `tx` says nothing.
+    pub directed: bool,
 }
 
 enum Kind {
@@ -43,6 +49,8 @@ enum Kind {
         buses: Vec<String>,
         newest_ns: u64,
         ended: bool,
+        /// Not in what was imported from a log without it.
+        directed: bool,
     },
 }
 
@@ -64,7 +72,14 @@ impl Source {
         let mut file = BufReader::with_capacity(256 * 1024, file);
         let kind = if file.fill_buf().map_err(cannot)?.starts_with(MCAP_MAGIC) {
             let recording = Box::new(Recording::open(path)?);
-            Kind::Recording { recording, merge: None, buses: Vec::new(), newest_ns: 0, ended: false }
+            Kind::Recording {
+                recording,
+                merge: None,
+                buses: Vec::new(),
+                newest_ns: 0,
+                ended: false,
+                directed: true,
+            }
         } else {
             Kind::Log { file, reader: Reader::default(), number: 0, line: Vec::new() }
         };
@@ -89,8 +104,8 @@ impl Source {
     pub fn next_frame(&mut self) -> anyhow::Result<Option<Logged>> {
         match &mut self.kind {
             Kind::Log { file, reader, number, line } => next_line(&self.path, file, reader, number, line),
-            Kind::Recording { recording, merge, buses, newest_ns, ended } => {
-                next_recorded(recording, merge, buses, newest_ns, ended)
+            Kind::Recording { recording, merge, buses, newest_ns, ended, directed } => {
+                next_recorded(recording, merge, buses, newest_ns, ended, directed)
             }
         }
     }
@@ -131,9 +146,15 @@ fn next_line(
                 bus: found.bus.to_string(),
                 frame: found.frame,
                 tx: found.tx,
+                directed: has_direction(reader.format(), &text),
             }));
         }
     }
+}
+
+/// ASC has a column for it, a candump log may have a fourth (`candump -x`).
+fn has_direction(format: Option<Format>, line: &str) -> bool {
+    format != Some(Format::Candump) || line.split_ascii_whitespace().nth(3).is_some()
 }
 
 fn next_recorded(
@@ -142,6 +163,7 @@ fn next_recorded(
     buses: &mut Vec<String>,
     newest_ns: &mut u64,
     ended: &mut bool,
+    directed: &mut bool,
 ) -> anyhow::Result<Option<Logged>> {
     loop {
         let now_ns = if *ended { u64::MAX } else { *newest_ns };
@@ -155,7 +177,14 @@ fn next_recorded(
             *ended = true;
             continue;
         };
-        let Item::Message(message) = item else { continue };
+        let message = match item {
+            Item::Message(message) => message,
+            Item::Metadata(meta) if meta.name == META_RECORDING => {
+                *directed = meta.entries.get(DIRECTION).is_none_or(|v| v != DIRECTION_UNKNOWN);
+                continue;
+            }
+            _ => continue,
+        };
         if message.channel.kind != Some(TopicKind::CanRx) {
             continue;
         }
@@ -172,7 +201,8 @@ fn next_recorded(
         });
         let t_ns = message.log_time;
         let tx = frame.flags & can_flag::TX_ECHO != 0;
-        let logged = Logged { t_ns, bus: bus.to_owned(), frame: super::to_frame(&frame), tx };
+        let logged =
+            Logged { t_ns, bus: bus.to_owned(), frame: super::to_frame(&frame), tx, directed: *directed };
         *newest_ns = t_ns.max(*newest_ns);
         let channels = || recording.channels().filter(|c| c.kind == Some(TopicKind::CanRx)).count();
         merge.get_or_insert_with(|| Merge::new(channels(), HOLD_NS)).push(at, t_ns, logged);
@@ -189,6 +219,8 @@ pub struct Contents {
     pub frames: u64,
     /// Of these, error frames.
     pub errors: u64,
+    /// Of these, without a word about who sent them.
+    pub undirected: u64,
     /// Earliest and latest.
     pub first_ns: u64,
     pub last_ns: u64,
@@ -201,6 +233,7 @@ pub fn contents(path: &Path) -> anyhow::Result<Contents> {
     while let Some(logged) = source.next_frame()? {
         contents.frames += 1;
         contents.errors += u64::from(logged.frame.is_error());
+        contents.undirected += u64::from(!logged.directed);
         contents.first_ns = contents.first_ns.min(logged.t_ns);
         contents.last_ns = contents.last_ns.max(logged.t_ns);
         if let Some(count) = contents.buses.get_mut(&logged.bus) {

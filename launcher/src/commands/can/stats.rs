@@ -35,7 +35,8 @@ struct Row {
     max_ns: u64,
     shortest: u8,
     longest: u8,
-    names: String,
+    /// Without their values: many frames, many values.
+    names: Vec<String>,
 }
 
 impl Row {
@@ -109,8 +110,8 @@ impl Stats {
             row.add(message);
         } else if self.rows.len() < MAX_IDS {
             let described = names.describe(&bus.name, message);
-            let described: Vec<String> = described.into_iter().map(|(name, _)| name).collect();
-            let mut row = Row { names: described.join(" "), ..Row::default() };
+            let names = described.into_iter().map(|(name, _)| name).collect();
+            let mut row = Row { names, ..Row::default() };
             row.add(message);
             self.rows.insert(key, row);
         } else {
@@ -154,7 +155,7 @@ impl Stats {
                     mean,
                     max,
                     len,
-                    row.names.clone(),
+                    row.names.join(" "),
                 ]
             })
             .collect();
@@ -191,7 +192,8 @@ impl Stats {
                     "frames": row.frames, "sent": row.sent, "frames_per_s": row.frames as f64 / seconds,
                     "period_min_ms": periods.map(|p| p[0]), "period_mean_ms": periods.map(|p| p[1]),
                     "period_max_ms": periods.map(|p| p[2]),
-                    "len_min": row.shortest, "len_max": row.longest, "names": row.names,
+                    "len_min": row.shortest, "len_max": row.longest,
+                    "names": row.names.iter().map(|n| (n.clone(), None)).collect::<BTreeMap<String, Option<String>>>(),
                 })
             })
             .collect();
@@ -346,7 +348,9 @@ far   7FF       1       2.0       -       -        -       1
       "id_text": "123",
       "len_max": 2,
       "len_min": 1,
-      "names": "Speed",
+      "names": {
+        "Speed": null
+      },
       "period_max_ms": 20.0,
       "period_mean_ms": 15.0,
       "period_min_ms": 10.0,
@@ -361,7 +365,7 @@ far   7FF       1       2.0       -       -        -       1
       "id_text": "00000123",
       "len_max": 0,
       "len_min": 0,
-      "names": "",
+      "names": {},
       "period_max_ms": null,
       "period_mean_ms": null,
       "period_min_ms": null,
@@ -376,7 +380,7 @@ far   7FF       1       2.0       -       -        -       1
       "id_text": "7FF",
       "len_max": 1,
       "len_min": 1,
-      "names": "",
+      "names": {},
       "period_max_ms": null,
       "period_mean_ms": null,
       "period_min_ms": null,

@@ -2,6 +2,7 @@
 
 mod bus;
 mod eds;
+mod emcy;
 mod lss;
 mod network;
 mod plan;
@@ -10,6 +11,7 @@ mod value;
 
 use crate::cli::Which;
 use clap::{Args, Subcommand, ValueEnum};
+use dinrail_canopen::protocol::lss::LssState;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -86,7 +88,17 @@ pub enum CanopenCommand {
         #[command(flatten)]
         master: MasterArgs,
     },
-    /// Give devices node-ids over the bus (CiA 305)
+    /// How the boot-up of nodes goes or went: step, tries, time, letter
+    BootState {
+        #[arg(value_parser = clap::value_parser!(u8).range(1..=127))]
+        node: Option<u8>,
+        #[command(flatten)]
+        master: MasterArgs,
+    },
+    /// Emergency messages that the master saw, newest first; or let a device of the stack report one
+    #[command(args_conflicts_with_subcommands = true)]
+    Emcy(EmcyArgs),
+    /// Give devices node-ids and bit rates over the bus (CiA 305)
     #[command(subcommand)]
     Lss(LssCommand),
     /// Look at EDS and DCF files
@@ -165,21 +177,90 @@ pub enum SdoCommand {
     },
 }
 
-/// One device among those without node-id, or with a known identity.
+#[derive(Debug, Args)]
+pub struct EmcyArgs {
+    #[command(subcommand)]
+    pub command: Option<EmcyCommand>,
+    /// Only of this node
+    #[arg(value_parser = clap::value_parser!(u8).range(1..=127))]
+    pub node: Option<u8>,
+    /// Forget them; the list in the device (1003h) stays
+    #[arg(long)]
+    pub clear: bool,
+    #[command(flatten)]
+    pub master: MasterArgs,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum EmcyCommand {
+    /// A canopen-slave of the stack reports an error
+    Send {
+        /// Emergency error code, like 0x4210
+        #[arg(value_parser = code)]
+        code: u16,
+        /// Bits of the error register besides bit 0, which is always set
+        #[arg(long, value_parser = byte, default_value = "0")]
+        register: u8,
+        /// Up to 5 manufacturer-specific bytes, in hex
+        #[arg(long, value_name = "HEX", default_value = "")]
+        data: String,
+        /// The canopen-slave service; not needed when the stack has only one
+        #[arg(long, value_name = "NAME")]
+        service: Option<String>,
+        #[command(flatten)]
+        which: Which,
+    },
+    /// A canopen-slave of the stack reports that an error is gone
+    Reset {
+        /// Only this error; without it all that were sent by `emcy send` or jobs
+        #[arg(value_parser = code)]
+        code: Option<u16>,
+        /// The canopen-slave service; not needed when the stack has only one
+        #[arg(long, value_name = "NAME")]
+        service: Option<String>,
+        #[command(flatten)]
+        which: Which,
+    },
+}
+
+/// The device with a known identity, or the only one.
 #[derive(Debug, Clone, Args)]
 pub struct AddressArgs {
     /// Vendor-ID (1018h:01)
-    #[arg(long, value_parser = number)]
-    pub vendor: u32,
+    #[arg(long, value_parser = number, required_unless_present = "sole")]
+    pub vendor: Option<u32>,
     /// Product code (1018h:02)
-    #[arg(long, value_parser = number)]
-    pub product: u32,
+    #[arg(long, value_parser = number, required_unless_present = "sole")]
+    pub product: Option<u32>,
     /// Revision number (1018h:03)
-    #[arg(long, value_parser = number)]
-    pub revision: u32,
+    #[arg(long, value_parser = number, required_unless_present = "sole")]
+    pub revision: Option<u32>,
     /// Serial number (1018h:04)
-    #[arg(long, value_parser = number)]
-    pub serial: u32,
+    #[arg(long, value_parser = number, required_unless_present = "sole")]
+    pub serial: Option<u32>,
+    /// The only device of the bus, whatever its identity
+    #[arg(long, conflicts_with_all = ["vendor", "product", "revision", "serial"])]
+    pub sole: bool,
+}
+
+/// Bounds of a number.
+#[derive(Debug, Clone, Copy)]
+pub struct Range(pub (u32, u32));
+
+/// States of an LSS slave.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum LssStateWord {
+    Waiting,
+    Configuration,
+}
+
+impl LssStateWord {
+    fn state(self) -> LssState {
+        match self {
+            Self::Waiting => LssState::Waiting,
+            Self::Configuration => LssState::Configuration,
+        }
+    }
 }
 
 #[derive(Debug, Subcommand)]
@@ -192,8 +273,14 @@ pub enum LssCommand {
         /// Let each device keep its node-id
         #[arg(long)]
         store: bool,
+        /// How long each question waits for an answer; 100 without it
+        #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u16).range(1..=5000))]
+        timeout: Option<u16>,
         #[command(flatten)]
         bus: BusArgs,
+        /// Not through the canopen-master of the bus, but from this command
+        #[arg(long)]
+        direct: bool,
     },
     /// Give the device of this identity a node-id
     SetNodeId {
@@ -206,6 +293,9 @@ pub enum LssCommand {
         store: bool,
         #[command(flatten)]
         bus: BusArgs,
+        /// Not through the canopen-master of the bus, but from this command
+        #[arg(long)]
+        direct: bool,
     },
     /// Set the bit rate of the device of this identity; it takes effect at its next start, or at once with --activate
     SetBitrate {
@@ -220,13 +310,58 @@ pub enum LssCommand {
         activate: Option<u16>,
         #[command(flatten)]
         bus: BusArgs,
+        /// Not through the canopen-master of the bus, but from this command
+        #[arg(long)]
+        direct: bool,
     },
-    /// The node-id of the device of this identity
+    /// Identity and node-id of the device of this identity
     Inquire {
         #[command(flatten)]
         address: AddressArgs,
         #[command(flatten)]
         bus: BusArgs,
+        /// Not through the canopen-master of the bus, but from this command
+        #[arg(long)]
+        direct: bool,
+    },
+    /// Is there a device without node-id, or one of this make?
+    Identify {
+        /// Vendor-ID (1018h:01)
+        #[arg(long, value_parser = number, requires = "product")]
+        vendor: Option<u32>,
+        /// Product code (1018h:02)
+        #[arg(long, value_parser = number, requires = "vendor")]
+        product: Option<u32>,
+        /// Revision number (1018h:03), or bounds: 1..9
+        #[arg(long, value_parser = lss::range, default_value = "0..0xFFFFFFFF", requires = "vendor")]
+        revision: Range,
+        /// Serial number (1018h:04), or bounds
+        #[arg(long, value_parser = lss::range, default_value = "0..0xFFFFFFFF", requires = "vendor")]
+        serial: Range,
+        #[command(flatten)]
+        bus: BusArgs,
+        /// Not through the canopen-master of the bus, but from this command
+        #[arg(long)]
+        direct: bool,
+    },
+    /// Send all devices into a state; those in configuration do not answer a fastscan
+    Switch {
+        state: LssStateWord,
+        #[command(flatten)]
+        bus: BusArgs,
+        /// Not through the canopen-master of the bus, but from this command
+        #[arg(long)]
+        direct: bool,
+    },
+    /// Let the devices in configuration change over to the bit rate they were set to
+    Activate {
+        /// Milliseconds of silence before and after
+        delay: u16,
+        #[command(flatten)]
+        bus: BusArgs,
+        /// Not through the canopen-master of the bus, but from this command
+        #[arg(long)]
+        direct: bool,
     },
 }
 
@@ -280,6 +415,16 @@ fn number(text: &str) -> Result<u32, String> {
     parsed.ok_or_else(|| "a number like 4660 or 0x1234".to_owned())
 }
 
+fn code(text: &str) -> Result<u16, String> {
+    let code = number(text)?;
+    u16::try_from(code).map_err(|_| format!("{text} is no 16-bit code"))
+}
+
+fn byte(text: &str) -> Result<u8, String> {
+    let byte = number(text)?;
+    u8::try_from(byte).map_err(|_| format!("{text} is no byte"))
+}
+
 pub fn run(command: CanopenCommand, json: bool) -> anyhow::Result<ExitCode> {
     let done = |result: anyhow::Result<()>| result.map(|()| ExitCode::SUCCESS);
     match command {
@@ -288,6 +433,8 @@ pub fn run(command: CanopenCommand, json: bool) -> anyhow::Result<ExitCode> {
         CanopenCommand::Sdo(command) => done(network::sdo(command, json)),
         CanopenCommand::Nmt { command, node, master } => done(network::nmt(command, node, &master, json)),
         CanopenCommand::Boot { node, master } => done(network::boot(node, &master, json)),
+        CanopenCommand::BootState { node, master } => done(network::boot_state(node, &master, json)),
+        CanopenCommand::Emcy(args) => done(emcy::run(args, json)),
         CanopenCommand::Lss(command) => done(lss::run(command, json)),
         CanopenCommand::Eds(EdsCommand::Check { files }) => eds::check(&files, json),
         CanopenCommand::Eds(EdsCommand::Show { file, filter }) => {

@@ -1,7 +1,7 @@
 //! What is done through the canopen-master of a running stack.
 
 use super::super::{UsageError, println, table};
-use super::{MasterArgs, Nmt, SdoCommand, value};
+use super::{MasterArgs, Nmt, SdoCommand, emcy, value};
 use crate::supervise::client::{find, observe};
 use crate::supervise::jobs::{JobLine, choose};
 use anyhow::Context as _;
@@ -15,7 +15,7 @@ const AT_ONCE: Duration = Duration::from_secs(5);
 /// A transfer of 1 MB at 10 kbit/s would take longer; then its progress is seen in `can dump`.
 const TRANSFER: Duration = Duration::from_mins(10);
 
-fn line(master: &MasterArgs) -> anyhow::Result<(JobLine, String)> {
+pub fn line(master: &MasterArgs) -> anyhow::Result<(JobLine, String)> {
     let running = find(master.which.stack.as_deref())?;
     let mut ctx = observe(&running)?;
     let service = choose(&ctx, KIND, master.service.as_deref())?;
@@ -79,6 +79,17 @@ fn status_text(service: &str, status: &Value) -> String {
         word(&status["network"]["syncs"]),
         word(&status["network"]["syncs_missed"]),
     ));
+    for queue in status["queues"].as_array().into_iter().flatten() {
+        text.push_str(&format!(
+            "queue of node {}, PDO {:03X}h: {} of {} wait, at most {} did, {} dropped\n",
+            word(&queue["node"]),
+            queue["cob_id"].as_u64().unwrap_or(0),
+            word(&queue["waiting"]),
+            word(&queue["size"]),
+            word(&queue["most"]),
+            word(&queue["dropped"]),
+        ));
+    }
     text
 }
 
@@ -94,6 +105,45 @@ pub fn boot(node: u8, master: &MasterArgs, as_json: bool) -> anyhow::Result<()> 
     line.ask(&json!({ "do": "boot", "node": node }), AT_ONCE)?;
     told(as_json, &json!({ "node": node }), "boot-up begins; `dinrail canopen status` shows how it goes");
     Ok(())
+}
+
+pub fn boot_state(node: Option<u8>, master: &MasterArgs, as_json: bool) -> anyhow::Result<()> {
+    let (mut line, _) = line(master)?;
+    let mut state = line.ask(&json!({ "do": "boot_state", "node": node }), AT_ONCE)?;
+    if !state.is_array() {
+        state = Value::Array(vec![state]);
+    }
+    println(&if as_json { state.to_string() } else { boot_text(&state).trim_end().to_owned() });
+    Ok(())
+}
+
+fn boot_text(state: &Value) -> String {
+    let word = |v: &Value| match v {
+        Value::String(text) => text.clone(),
+        Value::Null => "-".to_owned(),
+        other => other.to_string(),
+    };
+    let nodes = state.as_array().map_or(&[][..], Vec::as_slice);
+    let row = |n: &Value| {
+        let took = n["took_ms"].as_u64().map_or_else(|| "-".to_owned(), |ms| format!("{ms} ms"));
+        vec![
+            word(&n["id"]),
+            word(&n["name"]),
+            word(&n["step"]),
+            word(&n["tries"]),
+            emcy::time(&n["began_utc_ms"]),
+            took,
+            word(&n["letter"]),
+        ]
+    };
+    let rows: Vec<Vec<String>> = nodes.iter().map(row).collect();
+    let mut text = table(&["NODE", "NAME", "BOOT", "TRIES", "LAST BEGAN", "TOOK", "LETTER"], &rows);
+    for node in nodes {
+        if let Some(said) = node.get("text").and_then(Value::as_str) {
+            text.push_str(&format!("\nnode {}: {said}\n", word(&node["id"])));
+        }
+    }
+    text
 }
 
 fn told(as_json: bool, value: &Value, text: &str) {
@@ -195,6 +245,7 @@ mod tests {
                   "last_emcy": "8130h", "letter": "B", "failure": "boot-up failed with letter B: no answer; try 3" },
             ],
             "pdo": { "rx_pdos": 10, "tx_pdos": 11, "complete_samples": 9, "incomplete_samples": 1 },
+            "queues": [{ "node": 2, "cob_id": 386, "size": 64, "waiting": 3, "most": 49, "dropped": 0 }],
             "network": { "syncs": 12, "syncs_missed": 0 },
         });
         insta::assert_snapshot!(status_text("io", &status), @r"
@@ -207,6 +258,7 @@ mod tests {
         node 3: boot-up failed with letter B: no answer; try 3
 
         PDOs received 10, sent 11; samples complete 9, incomplete 1; SYNC sent 12, left out 0
+        queue of node 2, PDO 182h: 3 of 64 wait, at most 49 did, 0 dropped
         ");
     }
 

@@ -25,6 +25,9 @@ pub struct ExportArgs {
     /// Default: standard output
     #[arg(short, long, value_name = "FILE")]
     pub output: Option<PathBuf>,
+    /// `T` or `R` behind each line of a candump log, as `candump -x` does, where the file tells who sent it
+    #[arg(long)]
+    pub direction: bool,
     /// Only this bus (`can0`) or topic (`can0/rx`)
     #[arg(long, visible_alias = "topic", value_name = "BUS", value_delimiter = ',')]
     pub bus: Vec<String>,

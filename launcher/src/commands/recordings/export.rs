@@ -2,28 +2,29 @@
 
 use super::convert::{ExportArgs, LogFormat, chosen, create};
 use crate::commands::can::source::{Logged, Source, contents};
-use crate::commands::{DATA_LOSS, println};
+use crate::commands::{DATA_LOSS, UsageError, println};
 use dinrail_can::protocol::{asc, candump};
 use std::io::{BufWriter, Write};
 use std::process::ExitCode;
 
 /// Makes lines of frames.
 enum Lines {
-    Candump,
+    /// Whether with the direction.
+    Candump(bool),
     Asc(asc::Writer, Vec<(String, u16)>),
 }
 
 impl Lines {
-    fn new(format: LogFormat, first_ns: u64, buses: &[String]) -> Self {
+    fn new(format: LogFormat, direction: bool, first_ns: u64, buses: &[String]) -> Self {
         match format {
-            LogFormat::Candump => Self::Candump,
+            LogFormat::Candump => Self::Candump(direction),
             LogFormat::Asc => Self::Asc(asc::Writer::new(first_ns), channels(buses)),
         }
     }
 
     fn header(&self) -> String {
         match self {
-            Self::Candump => String::new(),
+            Self::Candump(_) => String::new(),
             Self::Asc(writer, channels) => {
                 let names = channels.iter().map(|(bus, channel)| format!("// channel {channel} is {bus}\n"));
                 writer.header() + &names.collect::<String>()
@@ -33,7 +34,14 @@ impl Lines {
 
     fn line(&self, logged: &Logged) -> String {
         match self {
-            Self::Candump => candump::format_log_line(logged.t_ns, &logged.bus, &logged.frame) + "\n",
+            Self::Candump(direction) => {
+                let column = match (direction & logged.directed, logged.tx) {
+                    (false, _) => "\n",
+                    (true, true) => " T\n",
+                    (true, false) => " R\n",
+                };
+                candump::format_log_line(logged.t_ns, &logged.bus, &logged.frame) + column
+            }
             Self::Asc(writer, channels) => {
                 let channel = channels.iter().find(|(bus, _)| *bus == logged.bus).map_or(1, |(_, c)| *c);
                 writer.line(logged.t_ns, channel, &logged.frame, logged.tx)
@@ -43,7 +51,7 @@ impl Lines {
 
     fn footer(&self) -> &'static str {
         match self {
-            Self::Candump => "",
+            Self::Candump(_) => "",
             Self::Asc(writer, _) => writer.footer(),
         }
     }
@@ -71,6 +79,11 @@ pub fn run(args: &ExportArgs, json: bool) -> anyhow::Result<ExitCode> {
         if asc { LogFormat::Asc } else { LogFormat::Candump }
     };
     let format = args.format.unwrap_or_else(by_ending);
+    if args.direction && matches!(format, LogFormat::Asc) {
+        return Err(
+            UsageError("an ASC file always tells the direction: leave out --direction".to_owned()).into()
+        );
+    }
     let to_stdout = args.output.is_none();
     let out: Box<dyn Write> = match &args.output {
         Some(path) => Box::new(create(path, &args.file, args.force)?),
@@ -78,7 +91,8 @@ pub fn run(args: &ExportArgs, json: bool) -> anyhow::Result<ExitCode> {
     };
     let mut out = BufWriter::new(out);
     let mut source = Source::open(&args.file)?;
-    let written = write(&mut source, format, &buses, contents.first_ns, &mut out);
+    let lines = Lines::new(format, args.direction, contents.first_ns, &buses);
+    let written = write(&mut source, &lines, &buses, &mut out);
     let frames = match written {
         Ok(frames) => frames,
         // The reader has seen enough.
@@ -103,14 +117,7 @@ fn is_broken_pipe(error: &anyhow::Error) -> bool {
     error.downcast_ref::<std::io::Error>().is_some_and(|e| e.kind() == std::io::ErrorKind::BrokenPipe)
 }
 
-fn write(
-    source: &mut Source,
-    format: LogFormat,
-    buses: &[String],
-    first_ns: u64,
-    out: &mut impl Write,
-) -> anyhow::Result<u64> {
-    let lines = Lines::new(format, first_ns, buses);
+fn write(source: &mut Source, lines: &Lines, buses: &[String], out: &mut impl Write) -> anyhow::Result<u64> {
     out.write_all(lines.header().as_bytes())?;
     let mut frames = 0;
     while let Some(logged) = source.next_frame()? {

@@ -1,7 +1,7 @@
 //! `dinrail recordings import`: a log as a recording that everything here reads.
 
 use super::convert::{ImportArgs, create, renamed};
-use crate::commands::can::source::{Contents, Source, contents};
+use crate::commands::can::source::{Contents, DIRECTION, DIRECTION_UNKNOWN, Source, contents};
 use crate::commands::println;
 use anyhow::Context as _;
 use dinrail_recorder::config::Compression;
@@ -63,7 +63,7 @@ fn write(
     log: &Path,
 ) -> anyhow::Result<u64> {
     let mut out = RecordingFile::new(Arc::new(file), Compression::Zstd, true)?;
-    out.metadata(META_RECORDING, about(log, source.what()))?;
+    out.metadata(META_RECORDING, about(log, source.what(), contents))?;
     // A log has one clock: its stamps are taken for both.
     out.metadata(META_CLOCK, clock_metadata(0, contents.first_ns, "imported"))?;
     let mut ports: BTreeMap<&str, (u16, u32, u64)> = BTreeMap::new();
@@ -103,13 +103,18 @@ fn write(
     Ok(frames)
 }
 
-fn about(log: &Path, what: &str) -> BTreeMap<String, String> {
+/// A log of which no frame tells its direction makes a recording that does not, either.
+fn about(log: &Path, what: &str, contents: &Contents) -> BTreeMap<String, String> {
     let name = log.file_name().map(|name| name.to_string_lossy().into_owned());
-    BTreeMap::from([
+    let mut about = BTreeMap::from([
         ("stack".to_owned(), "import".to_owned()),
         ("imported_from".to_owned(), name.unwrap_or_default()),
         ("imported_as".to_owned(), what.to_owned()),
         ("version".to_owned(), env!("CARGO_PKG_VERSION").to_owned()),
         ("host".to_owned(), host_name()),
-    ])
+    ]);
+    if contents.undirected > 0 {
+        about.insert(DIRECTION.to_owned(), DIRECTION_UNKNOWN.to_owned());
+    }
+    about
 }

@@ -1,13 +1,16 @@
 //! A service of kind `canopen-master`.
 
 use super::value::{Number, ObjectRef};
+use ipc_types::outputs::{self, STALE_AFTER, SafeOn, StopWord};
 use ipc_types::units::Span;
-use serde::{Deserialize, Deserializer, Serialize, de};
+use serde::{Deserialize, Serialize};
 
 /// Most `[[service.node]]`: the node-ids of CiA 301 clause 7.2.3 less the master's own.
 pub const MAX_NODES: usize = 126;
 /// Most objects mapped of one node: 512 PDOs of 8 bytes carry more, no real node does.
 pub const MAX_MAPS: usize = 512;
+/// Most values of a PDO that wait for a scan.
+pub const MAX_QUEUE: u32 = 64;
 /// Most objects written to a node at boot.
 pub const MAX_SDO_WRITES: usize = 1024;
 
@@ -80,74 +83,23 @@ impl Default for Config {
             nmt_inhibit_time: Span::from_ms(0),
             sdo_timeout: Span::from_ms(500),
             sdo_tries: 3,
-            stale_after: Span::from_ms(200),
-            safe_on: vec![SafeOn::Stop, SafeOn::Fault, SafeOn::Halted],
+            stale_after: STALE_AFTER,
+            safe_on: SafeOn::ALL.to_vec(),
             on_stop: OnStop::default(),
             nodes: Vec::new(),
         }
     }
 }
 
-/// States of the plc in which outputs go to their safe state.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum SafeOn {
-    /// Stopped by command.
-    Stop,
-    /// The program faulted.
-    Fault,
-    /// Halted at a breakpoint.
-    Halted,
-}
-
-/// Safe state: `"zero"`, `"hold"`, `"preop"`, `"stop"`, or `{ values = [...] }`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-#[serde(untagged)]
-pub enum OnStop {
-    Word(OnStopWord),
-    Values(StopValues),
-}
-
-impl<'de> Deserialize<'de> for OnStop {
-    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
-        struct Visit;
-        impl<'de> de::Visitor<'de> for Visit {
-            type Value = OnStop;
-            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-                f.write_str("\"zero\", \"hold\", \"preop\", \"stop\" or { values = [...] }")
-            }
-            fn visit_str<E: de::Error>(self, text: &str) -> Result<OnStop, E> {
-                OnStopWord::deserialize(de::value::StrDeserializer::<E>::new(text))
-                    .map(OnStop::Word)
-                    .map_err(|_| E::invalid_value(de::Unexpected::Str(text), &self))
-            }
-            // A derived untagged enum would swallow which key of the table is unknown.
-            fn visit_map<A: de::MapAccess<'de>>(self, map: A) -> Result<OnStop, A::Error> {
-                StopValues::deserialize(de::value::MapAccessDeserializer::new(map)).map(OnStop::Values)
-            }
-        }
-        d.deserialize_any(Visit)
-    }
-}
-
-/// The table form of [`OnStop`].
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct StopValues {
-    pub values: Vec<StopValue>,
-}
-
-impl Default for OnStop {
-    fn default() -> Self {
-        Self::Word(OnStopWord::Zero)
-    }
-}
+/// Safe state: a word, or values of some outputs; the others are zero then.
+pub type OnStop = outputs::OnStop<OnStopWord, StopValue>;
 
 /// Words of [`OnStop`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum OnStopWord {
     /// All outputs zero, nodes stay operational.
+    #[default]
     Zero,
     /// The last outputs stay.
     Hold,
@@ -155,6 +107,10 @@ pub enum OnStopWord {
     Preop,
     /// The nodes are stopped.
     Stop,
+}
+
+impl StopWord for OnStopWord {
+    const EXPECTED: &'static str = "\"zero\", \"hold\", \"preop\", \"stop\" or { values = [...] }";
 }
 
 /// One output of the safe state.
@@ -378,6 +334,9 @@ pub struct Map {
     /// %IB that shows the quality to the program.
     #[serde(default)]
     pub status_to: Option<String>,
+    /// Each received value of the PDO reaches one scan, in order; so many wait. Absent: the newest counts.
+    #[serde(default)]
+    pub queue: Option<u32>,
 }
 
 /// Value of an input while it is bad.
@@ -428,6 +387,21 @@ mod tests {
         assert!(config.nodes[0].tpdo[0].enabled);
         let again: Config = serde_json::from_value(serde_json::to_value(&config).unwrap()).unwrap();
         assert_eq!(again, config);
+    }
+
+    #[test]
+    fn safe_states_are_words_or_values() {
+        let read = |value| serde_json::from_value::<OnStop>(value);
+        assert_eq!(OnStop::default(), read(json!("zero")).unwrap());
+        let value = json!({ "values": [{ "from": "%QB0", "value": 5 }] });
+        let OnStop::Values(table) = read(value).unwrap() else { panic!("values are a table") };
+        assert_eq!(table.values[0].from, "%QB0");
+        let said = |value| read(value).unwrap_err().to_string();
+        let all = [said(json!("off")), said(json!({ "values": [{ "form": "%QB0", "value": 5 }] }))];
+        insta::assert_snapshot!(all.join("\n"), @r#"
+        invalid value: string "off", expected "zero", "hold", "preop", "stop" or { values = [...] }
+        unknown field `form`, expected `from` or `value`
+        "#);
     }
 
     #[test]

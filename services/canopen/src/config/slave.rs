@@ -2,6 +2,7 @@
 
 use super::master::OnBadWord;
 use super::value::ObjectRef;
+use ipc_types::outputs::STALE_AFTER;
 use ipc_types::units::Span;
 use serde::{Deserialize, Serialize};
 
@@ -40,7 +41,7 @@ impl Default for Config {
             simulate: None,
             store: None,
             serial_number: None,
-            stale_after: Span::from_ms(200),
+            stale_after: STALE_AFTER,
             map: Vec::new(),
         }
     }

@@ -1,4 +1,4 @@
-//! The boot-up of one node (CiA 302-2 V4.1, clause 5, "Boot NMT slave"), sans-I/O.
+//! The boot-up of one node (CiA 302-2 V4.1, figures 4 to 11, "Boot NMT slave"), sans-I/O.
 //!
 //! The machine asks for SDO transfers and NMT commands through [`Action`] and is told how they ended. It never waits
 //! by itself and never gives up for good: a node that failed is tried again, because a plant is repaired while it runs.
@@ -209,6 +209,8 @@ pub struct Boot {
     plan: Plan,
     step: Step,
     attempt: u32,
+    /// Tries of the last boot-up that went well.
+    took: u32,
     /// Tries of the current transfer.
     tries: u8,
     began_ns: u64,
@@ -230,6 +232,7 @@ impl Boot {
             plan,
             step: Step::Idle,
             attempt: 0,
+            took: 0,
             tries: 0,
             began_ns: 0,
             at_ns: None,
@@ -243,9 +246,13 @@ impl Boot {
     pub fn plan(&self) -> &Plan {
         &self.plan
     }
-    /// Tries since the node was last running.
+    /// Tries of the boot-up under way; of a node that runs, the tries it took.
     pub fn attempts(&self) -> u32 {
-        self.attempt
+        if self.attempt > 0 { self.attempt } else { self.took }
+    }
+    /// When the last try began; 0: none did.
+    pub fn began_ns(&self) -> u64 {
+        self.began_ns
     }
     /// Between the first question and the end.
     pub fn is_busy(&self) -> bool {
@@ -288,7 +295,7 @@ impl Boot {
 
     /// Ends everything: the node is not booted by this master any more until [`Self::start`].
     pub fn stop(&mut self) {
-        (self.step, self.at_ns, self.attempt) = (Step::Idle, None, 0);
+        (self.step, self.at_ns, self.attempt, self.took) = (Step::Idle, None, 0, 0);
         self.actions.clear();
     }
 
@@ -502,7 +509,7 @@ impl Boot {
     fn done(&mut self) {
         self.step = Step::Running;
         (self.at_ns, self.fresh) = (None, false);
-        self.attempt = 0;
+        (self.took, self.attempt) = (self.attempt, 0);
         self.actions.push(Action::Done { kept: self.kept });
     }
 
@@ -512,8 +519,14 @@ impl Boot {
         self.state = Some(127);
         match self.step {
             Step::Reset { restored } => self.restore_or_configure(now_ns, restored),
-            // It was reset by somebody while it was configured or ran: begin again.
             Step::Idle => {}
+            // The reset at the start of the network, or one by somebody else, before anything was written: the same try.
+            Step::DeviceType | Step::Vendor | Step::Product | Step::Revision | Step::Serial | Step::State => {
+                self.actions.clear();
+                self.attempt = self.attempt.saturating_sub(1);
+                self.start(now_ns);
+            }
+            // It was reset by somebody while it was configured or ran: begin again.
             _ => {
                 self.actions.clear();
                 self.start(now_ns);

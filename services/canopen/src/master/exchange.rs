@@ -5,116 +5,24 @@
 //! image. Which SYNC a frame belongs to is decided by the order on the bus, where the master's own SYNC comes back
 //! as an echo, never by a clock.
 //!
+//! A PDO with a queue is no part of a sample: each of its values is shown to exactly one scan, in order.
+//!
 //! Nothing allocates after [`Exchange::new`].
+
+mod model;
+mod queue;
+
+pub use model::{Counters, Field, Plan, RxPdo, TxPdo, transmission};
+pub use queue::QueueState;
 
 use crate::protocol::io::Outbox;
 use ipc_types::payload::{CanFrame, Quality, can_flag, id_flag};
-
-/// PDO transmission types (CiA 301 V4.2, tables 69 and 73).
-pub mod transmission {
-    /// Synchronous, when something changed.
-    pub const ACYCLIC: u8 = 0;
-    /// Synchronous, every n-th SYNC: 1 to this.
-    pub const CYCLIC_MAX: u8 = 240;
-    /// Sampled at SYNC, sent on a remote frame.
-    pub const SYNC_RTR: u8 = 252;
-    /// Sent on a remote frame.
-    pub const RTR: u8 = 253;
-    /// By an event of the manufacturer.
-    pub const EVENT_MANUFACTURER: u8 = 254;
-    /// By an event of the device profile.
-    pub const EVENT: u8 = 255;
-
-    /// Types 0 to 240.
-    pub fn is_synchronous(n: u8) -> bool {
-        n <= CYCLIC_MAX
-    }
-}
+use queue::Queue;
 
 /// Most bytes of a PDO on classic CAN.
 pub const PDO_BYTES: usize = 8;
 /// Bits of the identifier that count for finding a PDO, with the flag of the extended format.
 const ID_MASK: u32 = id_flag::EFF | id_flag::EFF_MASK;
-
-/// A value in a PDO and its place in the flat image buffer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Field {
-    /// First bit in the PDO, bit 0 = lowest of byte 0 (CiA 301 clause 7.4.7.1).
-    pub pdo_bit: u16,
-    /// 1 - 64.
-    pub bits: u16,
-    /// First byte in the flat buffer: the `inputs` tail, or the gathered outputs.
-    pub at: u32,
-    /// Bytes there: 1, 2, 4 or 8. A BOOL takes one byte of 0 or 1.
-    pub bytes: u8,
-    /// Narrower signed values are extended.
-    pub signed: bool,
-    /// Index of the range whose quality it is; unused for outputs.
-    pub range: u16,
-}
-
-/// A PDO that a node sends.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct RxPdo {
-    /// With [`id_flag::EFF`] for 29 bits.
-    pub cob_id: u32,
-    pub node: u8,
-    /// Bytes the mapping needs; shorter frames are refused (CiA 301 clause 7.2.2.5: PDO length error).
-    pub length: u8,
-    pub transmission: u8,
-    /// Without a frame for this long its inputs are stale.
-    pub deadline_ns: Option<u64>,
-    /// Remote frames are sent this often, for types 252 and 253.
-    pub poll_ns: Option<u64>,
-    pub fields: Vec<Field>,
-}
-
-/// A PDO that a node receives.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct TxPdo {
-    /// With [`id_flag::EFF`] for 29 bits.
-    pub cob_id: u32,
-    pub node: u8,
-    pub length: u8,
-    pub transmission: u8,
-    /// Least time between two.
-    pub inhibit_ns: u64,
-    /// Sent after this time also without change.
-    pub event_ns: Option<u64>,
-    pub fields: Vec<Field>,
-}
-
-/// All PDOs of a network.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Plan {
-    pub rx: Vec<RxPdo>,
-    pub tx: Vec<TxPdo>,
-    /// Ranges of the `inputs` tail: bytes of each.
-    pub input_bytes: Vec<u8>,
-    /// Bytes of the gathered outputs.
-    pub output_bytes: usize,
-    /// Of each node that shows its NMT state: node, offset in the tail, range.
-    pub states: Vec<(u8, u32, u16)>,
-}
-
-/// Counters since start.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
-pub struct Counters {
-    pub rx_pdos: u64,
-    pub tx_pdos: u64,
-    /// PDOs shorter than their mapping.
-    pub short: u64,
-    /// PDOs of nodes that are not operational.
-    pub not_operational: u64,
-    /// Samples published for a SYNC with everything in it.
-    pub complete_samples: u64,
-    /// Samples published at the end of the window, with something missing.
-    pub incomplete_samples: u64,
-    /// Synchronous PDOs that came outside of any window.
-    pub outside_window: u64,
-    /// Times an input became stale.
-    pub stale: u64,
-}
 
 #[derive(Debug, Clone)]
 struct Rx {
@@ -124,6 +32,10 @@ struct Rx {
     fresh: bool,
     /// Awaited in this window.
     expected: bool,
+    /// Its inputs were made bad and nothing has come since.
+    bad: bool,
+    /// Index of its queue, [`NONE`] for none.
+    queue: u16,
     /// SYNCs until its turn, for types above 1.
     syncs_left: u8,
     deadline_ns: Option<u64>,
@@ -168,9 +80,14 @@ pub struct Exchange {
     latched: Vec<u8>,
     window_ns: u64,
     window_end_ns: Option<u64>,
+    /// With the index of the PDO in `rx`.
+    queues: Vec<(usize, Queue)>,
     /// Fields are in the tail that were not published yet.
     dirty: bool,
-    sample: Option<Sample>,
+    /// SYNCs whose sample was not published yet.
+    samples_due: u64,
+    /// SYNCs whose sample was.
+    samples: u64,
     data_t_ns: u64,
     counters: Counters,
 }
@@ -221,11 +138,14 @@ impl Exchange {
                 *quality = Quality::Good as u8;
             }
         }
-        let rx = plan.rx.into_iter().map(|pdo| Rx {
+        let queue_of = |i: usize| plan.queues.iter().position(|(of, _)| usize::from(*of) == i);
+        let rx = plan.rx.into_iter().enumerate().map(|(i, pdo)| Rx {
             pdo,
             data: [0; PDO_BYTES],
             fresh: false,
             expected: false,
+            bad: false,
+            queue: queue_of(i).map_or(NONE, |queue| queue as u16),
             syncs_left: 1,
             deadline_ns: None,
             poll_at_ns: None,
@@ -252,8 +172,10 @@ impl Exchange {
             latched: vec![0; plan.output_bytes],
             window_ns,
             window_end_ns: None,
+            queues: plan.queues.iter().map(|&(i, size)| (usize::from(i), Queue::new(size.into()))).collect(),
             dirty: false,
-            sample: None,
+            samples_due: 0,
+            samples: 0,
             data_t_ns: 0,
             counters: Counters::default(),
         }
@@ -276,11 +198,47 @@ impl Exchange {
     }
     /// What is to be published since the last call.
     pub fn take_sample(&mut self) -> Option<Sample> {
-        if let Some(sample) = self.sample.take() {
-            self.dirty = false;
-            return Some(sample);
+        let sync = self.samples_due > 0;
+        self.samples += std::mem::take(&mut self.samples_due);
+        (std::mem::take(&mut self.dirty) || sync).then_some(Sample { sync })
+    }
+    /// Whether the sample of a SYNC waits for [`Self::take_sample`].
+    pub fn is_sample_due(&self) -> bool {
+        self.samples_due > 0
+    }
+    /// SYNCs whose sample has been taken for publication, since the start.
+    pub fn samples(&self) -> u64 {
+        self.samples
+    }
+
+    /// The tail was sent, and was with its readers at this time.
+    pub fn published(&mut self, t_ns: u64) {
+        for (_, queue) in &mut self.queues {
+            queue.sent(t_ns);
         }
-        std::mem::take(&mut self.dirty).then_some(Sample { sync: false })
+    }
+
+    /// A scan that ran a task took its inputs after this time: queues show what comes next.
+    pub fn on_scan(&mut self, inputs_t_ns: u64) {
+        for at in 0..self.queues.len() {
+            let (i, queue) = &mut self.queues[at];
+            let i = *i;
+            if let Some(data) = queue.scanned(inputs_t_ns)
+                && let Some(rx) = self.rx.get_mut(i)
+            {
+                rx.data = data;
+                self.decode(i);
+                self.dirty = true;
+            }
+        }
+    }
+
+    /// The queues, as the status shows them.
+    pub fn queues(&self) -> impl Iterator<Item = QueueState> + '_ {
+        self.queues.iter().filter_map(|(i, queue)| {
+            let pdo = &self.rx.get(*i)?.pdo;
+            Some(queue.state(pdo.node, pdo.cob_id))
+        })
     }
 
     /// The newest outputs, gathered from one image, or the safe state.
@@ -330,6 +288,7 @@ impl Exchange {
     /// Makes good inputs of a PDO bad.
     fn spoil(&mut self, i: usize, quality: Quality) {
         let mut any = false;
+        self.rx[i].bad = true;
         for field in &self.rx[i].pdo.fields {
             if let Some(byte) = self.tail.get_mut(self.values + usize::from(field.range))
                 && *byte == Quality::Good as u8
@@ -344,6 +303,25 @@ impl Exchange {
         }
     }
 
+    /// A PDO counts that came just now: it is shown, or waits in its queue.
+    fn accept(&mut self, i: usize) {
+        let rx = &self.rx[i];
+        if let Some((_, queue)) = self.queues.get_mut(usize::from(rx.queue))
+            && !queue.push(rx.data)
+        {
+            // Values flow again, whichever is shown.
+            for field in &rx.pdo.fields {
+                if let Some(quality) = self.tail.get_mut(self.values + usize::from(field.range)) {
+                    self.dirty |= *quality != Quality::Good as u8;
+                    *quality = Quality::Good as u8;
+                }
+            }
+            return;
+        }
+        self.decode(i);
+        self.dirty = true;
+    }
+
     /// Puts the received bytes of a PDO into the tail.
     fn decode(&mut self, i: usize) {
         let rx = &self.rx[i];
@@ -356,7 +334,9 @@ impl Exchange {
             if let Some(place) = self.tail.get_mut(at..at + bytes) {
                 place.copy_from_slice(&value.to_le_bytes()[..bytes]);
             }
-            if let Some(quality) = self.tail.get_mut(self.values + usize::from(field.range)) {
+            if !rx.bad
+                && let Some(quality) = self.tail.get_mut(self.values + usize::from(field.range))
+            {
                 *quality = Quality::Good as u8;
             }
         }
@@ -394,26 +374,31 @@ impl Exchange {
         let n = payload.len().min(PDO_BYTES);
         rx.data = [0; PDO_BYTES];
         rx.data[..n].copy_from_slice(&payload[..n]);
+        rx.bad = false;
         rx.deadline_ns = rx.pdo.deadline_ns.map(|d| t_ns.saturating_add(d));
         self.data_t_ns = self.data_t_ns.max(t_ns);
+        // In a queue every value counts, whenever it came.
+        let queued = rx.queue != NONE;
+        if queued {
+            self.accept(i);
+        }
+        let rx = &mut self.rx[i];
         if transmission::is_synchronous(rx.pdo.transmission) {
             if self.window_end_ns.is_none_or(|end_ns| t_ns > end_ns) {
                 self.counters.outside_window += 1;
                 // Type 0 tells of an event that may not be lost; a cyclic one comes again.
-                if rx.pdo.transmission == transmission::ACYCLIC {
-                    self.decode(i);
-                    self.dirty = true;
+                if rx.pdo.transmission == transmission::ACYCLIC && !queued {
+                    self.accept(i);
                 }
                 return true;
             }
-            rx.fresh = true;
+            rx.fresh = !queued;
             if std::mem::take(&mut rx.expected) && self.rx.iter().all(|rx| !rx.expected) {
                 self.counters.complete_samples += 1;
                 self.close_window();
             }
-        } else {
-            self.decode(i);
-            self.dirty = true;
+        } else if !queued {
+            self.accept(i);
         }
         true
     }
@@ -429,7 +414,7 @@ impl Exchange {
                 self.decode(i);
             }
         }
-        self.sample = Some(Sample { sync: true });
+        self.samples_due += 1;
     }
 
     /// The master's SYNC came back from the bus: what follows belongs to it.
@@ -455,7 +440,7 @@ impl Exchange {
         }
         self.window_end_ns = any.then(|| t_ns.saturating_add(self.window_ns));
         if !any {
-            self.sample = Some(Sample { sync: true });
+            self.samples_due += 1;
         }
     }
 

@@ -172,6 +172,193 @@ fn a_short_signed_value_is_extended() {
     assert_eq!(&exchange.tail()[..4], (-2i32).to_le_bytes());
 }
 
+/// A PDO of one counting byte of node 5, event-driven, with a queue.
+fn queued(size: u8) -> Exchange {
+    let plan = Plan {
+        rx: vec![
+            rx(0x185, 5, 255, vec![field(0, 8, 0, 1, 0)]),
+            rx(0x285, 5, 255, vec![field(0, 8, 1, 1, 1)]),
+        ],
+        input_bytes: vec![1, 1],
+        queues: vec![(0, size)],
+        ..Plan::default()
+    };
+    let mut exchange = Exchange::new(plan, 0);
+    exchange.set_operational(5, true, 0);
+    exchange
+}
+
+/// Publishes what is new.
+fn publish(exchange: &mut Exchange, now_ns: u64) -> Option<Sample> {
+    let sample = exchange.take_sample()?;
+    exchange.published(now_ns);
+    Some(sample)
+}
+
+fn waiting(exchange: &Exchange) -> (usize, usize, u64) {
+    let state = exchange.queues().next().unwrap();
+    (state.waiting, state.most, state.dropped)
+}
+
+#[test]
+fn every_value_of_a_queue_reaches_one_scan_in_order() {
+    let mut exchange = queued(64);
+    for n in 1..=50 {
+        exchange.on_frame(1, &CanFrame::classic(0x185, &[n]));
+        exchange.on_frame(1, &CanFrame::classic(0x285, &[n]));
+    }
+    let mut seen = Vec::new();
+    for t_ns in (10..).step_by(10) {
+        let published = publish(&mut exchange, t_ns);
+        if seen.len() == 50 {
+            assert_eq!(published, None);
+            break;
+        }
+        assert_eq!(published, Some(Sample { sync: false }), "at {t_ns}");
+        seen.push(exchange.tail()[0]);
+        // Without a queue only the last is sure.
+        assert_eq!(exchange.tail()[1..], [50, 0, 0]);
+        // A scan that looked before it was sent, and the same one again: it stays.
+        exchange.on_scan(t_ns - 1);
+        exchange.on_scan(t_ns);
+        assert_eq!(exchange.take_sample(), None);
+        exchange.on_scan(t_ns + 1);
+    }
+    assert_eq!(seen, (1..=50).collect::<Vec<u8>>());
+    assert_eq!(waiting(&exchange), (0, 49, 0));
+    // What comes later is shown at once again.
+    exchange.on_frame(1000, &CanFrame::classic(0x185, &[51]));
+    assert_eq!((publish(&mut exchange, 1001).is_some(), exchange.tail()[0]), (true, 51));
+}
+
+#[test]
+fn a_value_that_was_not_sent_is_not_taken() {
+    let mut exchange = queued(4);
+    exchange.on_frame(1, &CanFrame::classic(0x185, &[1]));
+    exchange.on_frame(2, &CanFrame::classic(0x185, &[2]));
+    assert!(exchange.take_sample().is_some());
+    // Sending failed: a scan cannot have seen it.
+    exchange.on_scan(100);
+    assert_eq!((exchange.take_sample(), exchange.tail()[0]), (None, 1));
+    exchange.published(200);
+    exchange.on_scan(150);
+    assert_eq!(exchange.tail()[0], 1);
+    // A repetition changes nothing about when it was there first.
+    exchange.published(300);
+    exchange.on_scan(250);
+    assert_eq!((exchange.take_sample().is_some(), exchange.tail()[0]), (true, 2));
+}
+
+#[test]
+fn a_full_queue_drops_the_oldest_that_waits_and_counts_it() {
+    let mut exchange = queued(4);
+    for n in 1..=10 {
+        exchange.on_frame(n.into(), &CanFrame::classic(0x185, &[n]));
+        // No plc runs: nothing is ever taken, however often it is published.
+        publish(&mut exchange, n.into());
+        assert_eq!(exchange.tail()[0], 1);
+    }
+    assert_eq!(waiting(&exchange), (4, 4, 5));
+    let mut seen = Vec::new();
+    for t_ns in [100, 200, 300, 400, 500, 600] {
+        seen.push(exchange.tail()[0]);
+        exchange.on_scan(t_ns);
+        publish(&mut exchange, t_ns + 1);
+    }
+    assert_eq!(seen, [1, 7, 8, 9, 10, 10]);
+    assert_eq!(waiting(&exchange), (0, 4, 5));
+}
+
+#[test]
+fn another_generation_of_the_plc_goes_on_where_the_last_one_was() {
+    let mut exchange = queued(8);
+    for n in 1..=3 {
+        exchange.on_frame(1, &CanFrame::classic(0x185, &[n]));
+    }
+    publish(&mut exchange, 10);
+    exchange.on_scan(11);
+    publish(&mut exchange, 12);
+    // It died; the next one has not run a task yet and says so.
+    exchange.on_scan(0);
+    assert_eq!((exchange.take_sample(), exchange.tail()[0]), (None, 2));
+    exchange.on_scan(50);
+    assert_eq!((publish(&mut exchange, 51).is_some(), exchange.tail()[0]), (true, 3));
+}
+
+#[test]
+fn values_of_a_lost_node_still_come_but_are_bad() {
+    let mut exchange = queued(8);
+    for n in 1..=3 {
+        exchange.on_frame(1, &CanFrame::classic(0x185, &[n]));
+    }
+    publish(&mut exchange, 10);
+    exchange.set_operational(5, false, 20);
+    assert!(publish(&mut exchange, 21).is_some());
+    assert_eq!(exchange.tail(), [1, 0, 1, 2]);
+    exchange.on_scan(30);
+    publish(&mut exchange, 31);
+    assert_eq!(exchange.tail(), [2, 0, 1, 2]);
+    // Good again with its first frame, which waits behind the others.
+    exchange.set_operational(5, true, 40);
+    exchange.on_frame(41, &CanFrame::classic(0x185, &[4]));
+    assert!(publish(&mut exchange, 42).is_some());
+    assert_eq!(exchange.tail(), [2, 0, 0, 2]);
+    exchange.on_scan(50);
+    publish(&mut exchange, 51);
+    exchange.on_scan(52);
+    assert_eq!(exchange.tail(), [4, 0, 0, 2]);
+}
+
+#[test]
+fn a_queue_is_no_part_of_the_sample_of_a_sync_and_does_not_delay_it() {
+    let plan = Plan {
+        rx: vec![rx(0x181, 1, 1, vec![field(0, 8, 0, 1, 0)]), rx(0x182, 2, 1, vec![field(0, 8, 1, 1, 1)])],
+        input_bytes: vec![1, 1],
+        queues: vec![(1, 8)],
+        ..Plan::default()
+    };
+    let mut exchange = Exchange::new(plan, 5 * MS);
+    exchange.set_operational(1, true, 0);
+    exchange.set_operational(2, true, 0);
+    for sync in 1..=3u8 {
+        let t_ns = u64::from(sync) * 10 * MS;
+        exchange.on_sync(t_ns);
+        exchange.on_frame(t_ns + 1, &CanFrame::classic(0x182, &[sync]));
+        assert_eq!(publish(&mut exchange, t_ns + 2).is_some(), sync == 1);
+        exchange.on_frame(t_ns + 3, &CanFrame::classic(0x181, &[sync]));
+        assert_eq!(publish(&mut exchange, t_ns + 4), Some(Sample { sync: true }));
+        // The queue still shows the first: no scan took it.
+        assert_eq!(exchange.tail(), [sync, 1, 0, 0]);
+        assert_eq!(exchange.samples(), u64::from(sync));
+    }
+    exchange.on_scan(99 * MS);
+    assert_eq!((publish(&mut exchange, 100 * MS), exchange.tail()[1]), (Some(Sample { sync: false }), 2));
+    assert_eq!((exchange.samples(), exchange.counters().complete_samples), (3, 3));
+}
+
+#[test]
+fn every_sync_counts_once_even_when_two_are_published_together() {
+    let plan = Plan {
+        rx: vec![rx(0x181, 1, 1, vec![field(0, 8, 0, 1, 0)])],
+        input_bytes: vec![1],
+        ..Plan::default()
+    };
+    let mut exchange = Exchange::new(plan, 5 * MS);
+    // No node is there: the sample is due at once.
+    exchange.on_sync(10 * MS);
+    assert!(exchange.is_sample_due());
+    assert_eq!((exchange.take_sample(), exchange.samples()), (Some(Sample { sync: true }), 1));
+    exchange.set_operational(1, true, 11 * MS);
+    exchange.on_sync(20 * MS);
+    assert!(!exchange.is_sample_due());
+    exchange.on_frame(20 * MS + 1, &CanFrame::classic(0x181, &[1]));
+    exchange.on_sync(30 * MS);
+    // The window of the second ends without its PDO.
+    exchange.on_time(36 * MS, &mut Outbox::default());
+    assert_eq!((exchange.take_sample(), exchange.samples()), (Some(Sample { sync: true }), 3));
+    assert_eq!((exchange.take_sample(), exchange.samples()), (None, 3));
+}
+
 proptest! {
     #[test]
     fn bits_round_trip(data in any::<[u8; 8]>(), first in 0u16..80, bits in 1u16..70, value: u64) {
@@ -206,5 +393,39 @@ proptest! {
                 prop_assert!(good.windows(2).all(|w| w[0] == w[1]), "{good:?}");
             }
         }
+    }
+
+    /// However frames, scans and messages between master and plc interleave: every value is seen, in order.
+    #[test]
+    fn a_queue_loses_and_swaps_nothing(steps in prop::collection::vec(0u8..6, 1..400)) {
+        let mut exchange = queued(255);
+        let (mut now_ns, mut sent) = (1u64, 0u8);
+        // What the plc reads next, what its scans saw, and the images on their way to the master.
+        let (mut inputs, mut seen, mut images) = (None::<u8>, Vec::new(), Vec::new());
+        for step in steps.into_iter().chain((0..1200u16).map(|i| 2 + (i % 3) as u8)) {
+            now_ns += 10;
+            match step {
+                0 | 1 if sent < 200 => {
+                    sent += 1;
+                    exchange.on_frame(now_ns, &CanFrame::classic(0x185, &[sent]));
+                }
+                2 => if exchange.take_sample().is_some() {
+                    inputs = Some(exchange.tail()[0]);
+                    exchange.published(now_ns);
+                },
+                3 => {
+                    seen.extend(inputs);
+                    images.push(now_ns);
+                }
+                // The newest image counts; a plc that dies takes its images along.
+                4 => if let Some(inputs_t_ns) = images.drain(..).next_back() {
+                    exchange.on_scan(inputs_t_ns);
+                },
+                5 if images.len() > 3 => images.clear(),
+                _ => {}
+            }
+        }
+        seen.dedup();
+        prop_assert_eq!(seen, (1..=sent).collect::<Vec<u8>>());
     }
 }

@@ -2,8 +2,11 @@
 
 pub mod boot;
 pub mod exchange;
+pub mod lss;
 pub mod network;
+#[cfg(test)]
+mod pdo_tests;
 pub mod plan;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 pub mod transfers;

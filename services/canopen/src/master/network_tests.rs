@@ -3,7 +3,9 @@ use crate::config::MasterConfig;
 use crate::master::boot::Letter;
 use crate::master::plan::{Plan, plan};
 use crate::master::testing::{Slave, device};
+use crate::protocol::nmt::NmtState;
 use dinrail_iec::Addressing;
+use ipc_types::payload::id_flag;
 use serde_json::json;
 use std::collections::BTreeMap;
 

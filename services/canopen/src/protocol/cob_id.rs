@@ -31,9 +31,9 @@ pub mod predefined {
     pub const SDO_RX: u32 = 0x600;
     /// NMT error control: plus node-id.
     pub const ERROR_CONTROL: u32 = 0x700;
-    /// LSS slave to master (CiA 305 V3.0, 4.2).
+    /// LSS slave to master (CiA 305 V3.0).
     pub const LSS_SLAVE: u32 = 0x7E4;
-    /// LSS master to slave (CiA 305 V3.0, 4.2).
+    /// LSS master to slave (CiA 305 V3.0).
     pub const LSS_MASTER: u32 = 0x7E5;
 }
 

@@ -47,6 +47,23 @@ pub mod register {
     pub const MANUFACTURER: u8 = 1 << 7;
 }
 
+/// Names of the bits of the error register (CiA 301 V4.2, 7.5.2.2, table 50).
+const REGISTER_BITS: [&str; 8] = [
+    "generic",
+    "current",
+    "voltage",
+    "temperature",
+    "communication",
+    "device profile",
+    "reserved",
+    "manufacturer",
+];
+
+/// The bits of an error register that are set, in words.
+pub fn register_bits(register: u8) -> Vec<&'static str> {
+    (0..8).filter(|bit| register >> bit & 1 != 0).map(|bit| REGISTER_BITS[bit]).collect()
+}
+
 /// One EMCY message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Emcy {
@@ -100,9 +117,11 @@ impl Emcy {
     }
 }
 
-/// Errors that can be active at once, messages that can wait for the inhibit time. Beyond: the error register still
-/// counts the error, the message is dropped and counted.
-pub const ACTIVE: usize = 64;
+/// Errors that can be active at once: three of each of 512 RPDOs, one of each of 127 nodes, and the application's.
+/// Beyond: neither message nor entry, but a count, since an error that is not kept could not be told from a new one.
+pub const ACTIVE: usize = 2048;
+/// Messages that can wait for the inhibit time. Beyond: the message is dropped and counted, the history has it.
+pub const WAITING: usize = 64;
 /// Sub-indices of 1003h (CiA 301 V4.2, 7.5.2.4).
 pub const HISTORY: usize = 254;
 
@@ -123,13 +142,12 @@ pub struct EmcyProducer {
     cob: CobId,
     inhibit_ns: u64,
     active: Vec<ActiveError>,
-    /// Errors beyond [`ACTIVE`] are not kept apart.
     waiting: Vec<Emcy>,
     free_at_ns: u64,
     history: [u32; HISTORY],
     history_len: usize,
     history_limit: usize,
-    /// Messages that were not sent because [`ACTIVE`] others waited.
+    /// Messages that were not sent because [`WAITING`] others waited or [`ACTIVE`] errors were there.
     pub dropped: u64,
 }
 
@@ -140,7 +158,7 @@ impl EmcyProducer {
             cob: CobId(super::cob_id::BIT_31),
             inhibit_ns: 0,
             active: Vec::with_capacity(ACTIVE),
-            waiting: Vec::with_capacity(ACTIVE),
+            waiting: Vec::with_capacity(WAITING),
             free_at_ns: 0,
             history: [0; HISTORY],
             history_len: 0,
@@ -183,9 +201,11 @@ impl EmcyProducer {
         if self.is_active(code, source) {
             return None;
         }
-        if self.active.len() < ACTIVE {
-            self.active.push(ActiveError { code, source, register });
+        if self.active.len() >= ACTIVE {
+            self.dropped += 1;
+            return None;
         }
+        self.active.push(ActiveError { code, source, register });
         let emcy = Emcy { code, register: self.register() | register | register::GENERIC, info };
         self.remember(&emcy);
         Some(self.queue(emcy))
@@ -215,7 +235,7 @@ impl EmcyProducer {
         self.history_len = kept + 1;
     }
     fn queue(&mut self, emcy: Emcy) -> Emcy {
-        if self.waiting.len() < ACTIVE {
+        if self.waiting.len() < WAITING {
             self.waiting.push(emcy);
         } else {
             self.dropped += 1;
@@ -341,7 +361,7 @@ mod tests {
     fn limits_hold() {
         let mut emcy = EmcyProducer::new(254);
         emcy.configure(CobId(0x84), 0);
-        for n in 0..1000u16 {
+        for n in 0..4000u16 {
             emcy.raise(
                 0xFF00,
                 n,
@@ -349,8 +369,11 @@ mod tests {
                 n.to_le_bytes().iter().copied().chain([0; 3]).collect::<Vec<_>>().try_into().unwrap(),
             );
         }
-        assert_eq!((emcy.history().len(), emcy.dropped), (254, 1000 - ACTIVE as u64));
-        assert_eq!(emcy.history()[0], 0x03E7_FF00);
+        assert_eq!((emcy.history().len(), emcy.dropped), (254, 4000 - WAITING as u64));
+        assert_eq!(emcy.history()[0], 0x07FF_FF00);
+        // An error that is not kept is none that comes anew each time.
+        assert!(emcy.raise(0xFF00, 3999, register::MANUFACTURER, [0; 5]).is_none());
+        assert!(emcy.clear(0xFF00, 5).is_some() && emcy.clear(0xFF00, 3999).is_none());
         let mut none = EmcyProducer::new(0);
         none.report(1, 1, [0; 5]);
         assert!(none.history().is_empty());

@@ -109,7 +109,7 @@ pub fn heartbeat_frame(node_id: u8, state: NmtState) -> CanFrame {
     CanFrame::classic(predefined::ERROR_CONTROL + u32::from(node_id), &[state.wire()])
 }
 
-/// Bits of 1F80h NMT startup (CiA 302-2 V4.1, 5.3.1).
+/// Bits of 1F80h NMT startup (CiA 302-2 V4.1, object 1F80h).
 pub mod startup {
     /// The device is NMT master.
     pub const MASTER: u32 = 1;
@@ -128,7 +128,7 @@ pub mod startup {
 }
 
 /// Does a slave with this 1F80h enter operational by itself behind its boot-up (CiA 301 V4.2, 7.3.2.2, figure 41;
-/// CiA 302-2 V4.1, 5.3.1 bit 2)? Without the object it waits for its master.
+/// CiA 302-2 V4.1, object 1F80h bit 2)? Without the object it waits for its master.
 pub fn self_starts(nmt_startup: Option<u32>) -> bool {
     nmt_startup.is_some_and(|value| value & startup::NO_SELF_START == 0)
 }

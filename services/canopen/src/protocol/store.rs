@@ -61,11 +61,13 @@ pub fn group(sub: u8) -> RangeInclusive<u16> {
     }
 }
 
-/// Values that are states or commands, not parameters.
+/// Values that are states, commands or process data, not parameters: an output that was on when "save" came must not
+/// be on at the next power-on. `rww` and `rwr` say that a value belongs to a PDO.
 fn is_parameter(entry: &Entry) -> bool {
     let stated =
         matches!(entry.index, 0x1001..=0x1003 | 0x1010 | 0x1011 | 0x1013 | 0x1023..=0x1025 | 0x1F50..=0x1F5F);
-    entry.access.writable() && entry.access != Access::Wo && !stated
+    let process = entry.mappable && matches!(entry.access, Access::Rww | Access::Rwr);
+    entry.access.writable() && entry.access != Access::Wo && !stated && !process
 }
 
 /// CRC-32 (ISO-HDLC, as in zip and Ethernet).
@@ -263,6 +265,23 @@ mod tests {
         assert_eq!([0x1017, 0x2000, 0x6000].map(|index| value_after(&mut store, index)), [99, 99, 8]);
         store.restore(&od, 1);
         assert!(store.image().is_empty());
+    }
+
+    #[test]
+    fn outputs_are_not_stored() {
+        let mut builder = OdBuilder::new();
+        let output = |access| EntryDef::new(DataType::Unsigned8, access);
+        builder.var(0x6200, output(Access::Rww).mappable()).var(0x6206, output(Access::Rww));
+        builder.var(0x6207, output(Access::Rw).mappable());
+        let mut od = builder.build(4).unwrap();
+        for index in [0x6200, 0x6206, 0x6207] {
+            od.set_uint(index, 0, 1).unwrap();
+        }
+        let mut store = Store::default();
+        store.save(&od, 1);
+        let mut fresh = builder.build(4).unwrap();
+        store.apply(&mut fresh, &(0..=0xFFFF));
+        assert_eq!([0x6200, 0x6206, 0x6207].map(|index| fresh.u8(index, 0)), [Some(0), Some(1), Some(1)]);
     }
 
     #[test]

@@ -3,12 +3,12 @@
 use super::TAKE_FRAMES;
 use crate::protocol::io::Outbox;
 use crate::slave::fleet::Fleet;
+use ipc_types::can_queue::CanQueue;
 use ipc_types::payload::CanFrame;
 use ipc_types::port::{Publisher, SendError, Subscriber};
 use ipc_types::rail::RailError;
 use ipc_types::topic::TopicKind;
 use ipc_types::{Context, clock};
-use std::collections::VecDeque;
 use std::time::Duration;
 
 /// An observer has no inbox: it looks this often.
@@ -20,9 +20,9 @@ const MAX_WAITING: usize = 4096;
 pub struct Player {
     rx: Subscriber<CanFrame>,
     tx: Publisher<CanFrame>,
-    waiting: VecDeque<CanFrame>,
+    queue: CanQueue,
     out: Outbox,
-    /// Frames that found no room.
+    /// Frames that were never sent: they found no room, or no driver.
     pub dropped: u64,
 }
 
@@ -31,8 +31,7 @@ impl Player {
     pub fn open(ctx: &mut Context, bus: &str) -> Result<Self, RailError> {
         let rx = ctx.subscriber(&TopicKind::CanRx.of(bus))?;
         let tx = ctx.publisher(&TopicKind::CanTx.of(bus))?;
-        let waiting = VecDeque::with_capacity(MAX_WAITING);
-        Ok(Self { rx, tx, waiting, out: Outbox::default(), dropped: 0 })
+        Ok(Self { rx, tx, queue: CanQueue::new(MAX_WAITING), out: Outbox::default(), dropped: 0 })
     }
 
     /// Plays until `step` says that it is enough: `step` is called between looks at the bus, with now, and may switch
@@ -60,11 +59,11 @@ impl Player {
     }
 
     fn take(&mut self, fleet: &mut Fleet) -> Result<usize, SendError> {
-        let (out, waiting, dropped) = (&mut self.out, &mut self.waiting, &mut self.dropped);
+        let (out, queue) = (&mut self.out, &mut self.queue);
         let taken = self.rx.drain(TAKE_FRAMES, |frame, _| {
             if frame.fault().is_none() {
                 fleet.on_frame(clock::mono_ns(), frame, out);
-                keep(out, waiting, dropped);
+                queue.add(out.drain());
             }
         });
         self.send()?;
@@ -72,36 +71,9 @@ impl Player {
     }
 
     fn send(&mut self) -> Result<(), SendError> {
-        keep(&mut self.out, &mut self.waiting, &mut self.dropped);
-        let mut any = false;
-        while let Some(frame) = self.waiting.front() {
-            match self.tx.send(*frame) {
-                Ok(_) => {
-                    any = true;
-                    self.waiting.pop_front();
-                }
-                // The driver is away: old frames are of no use to anybody.
-                Err(SendError::NoReader(_)) => {
-                    self.dropped += self.waiting.len() as u64;
-                    self.waiting.clear();
-                }
-                Err(SendError::Full(_)) => break,
-                Err(e) => return Err(e),
-            }
-        }
-        if any {
-            self.tx.ring();
-        }
-        Ok(())
-    }
-}
-
-fn keep(out: &mut Outbox, waiting: &mut VecDeque<CanFrame>, dropped: &mut u64) {
-    for frame in out.drain() {
-        if waiting.len() < MAX_WAITING {
-            waiting.push_back(frame);
-        } else {
-            *dropped += 1;
-        }
+        self.queue.add(self.out.drain());
+        let handed = self.queue.send(clock::mono_ns(), &mut self.tx, |_| {});
+        self.dropped = self.queue.dropped();
+        handed.map(|_| ())
     }
 }

@@ -1,6 +1,7 @@
 //! Jobs of the command line and of programs: JSON in, requests to the network out.
 
 use crate::config::{Number, ObjectRef};
+use crate::master::lss::LssCall;
 use crate::protocol::nmt::NmtCommand;
 use crate::protocol::sdo::Mode;
 use serde::Deserialize;
@@ -14,6 +15,8 @@ pub const MAX_FILE: u64 = 1 << 20;
 
 /// Code of a result: failed.
 pub const FAILED: u32 = 1;
+/// Code of a result: the time of the job was over.
+pub const LATE: u32 = 2;
 /// Code of a result: the job is not known.
 pub const NOT_SUPPORTED: u32 = 3;
 
@@ -21,38 +24,69 @@ pub const NOT_SUPPORTED: u32 = 3;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(tag = "do", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Request {
-    SdoRead {
-        node: u8,
-        object: ObjectRef,
-        #[serde(default)]
-        mode: Transfer,
-        /// Where the value is written to; without it, it is in the result, in hex.
-        #[serde(default)]
-        file: Option<PathBuf>,
-    },
-    SdoWrite {
-        node: u8,
-        object: ObjectRef,
-        /// In hex.
-        #[serde(default)]
-        data: Option<String>,
-        /// A value of the object's type, where the EDS says what it is.
-        #[serde(default)]
-        value: Option<Number>,
-        #[serde(default)]
-        file: Option<PathBuf>,
-        #[serde(default)]
-        mode: Transfer,
-    },
+    SdoRead(SdoRead),
+    SdoWrite(SdoWrite),
     Nmt {
         command: Nmt,
         /// 0 is all.
         node: u8,
     },
     /// Boots a node again from the beginning.
-    Boot { node: u8 },
+    Boot {
+        node: u8,
+    },
+    /// How the boot-up of a node goes or went; without node-id: of all.
+    BootState {
+        #[serde(default)]
+        node: Option<u8>,
+    },
+    Lss(LssCall),
+    /// What a node reported, newest first; without node-id how many messages there are of each.
+    Emcy {
+        #[serde(default)]
+        node: Option<u8>,
+        /// Leaves out as many messages, without node-id all nodes up to this one: a result holds only so much.
+        #[serde(default)]
+        skip: usize,
+    },
+    /// Forgets what a node reported; without node-id: what all did.
+    EmcyClear {
+        #[serde(default)]
+        node: Option<u8>,
+    },
     /// State of the network, whole.
     Status,
+}
+
+/// Reads an object.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SdoRead {
+    pub node: u8,
+    pub object: ObjectRef,
+    #[serde(default)]
+    pub mode: Transfer,
+    /// Where the value is written to; without it, it is in the result, in hex.
+    #[serde(default)]
+    pub file: Option<PathBuf>,
+}
+
+/// Writes an object.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SdoWrite {
+    pub node: u8,
+    pub object: ObjectRef,
+    /// In hex.
+    #[serde(default)]
+    pub data: Option<String>,
+    /// A value of the object's type, where the EDS says what it is.
+    #[serde(default)]
+    pub value: Option<Number>,
+    #[serde(default)]
+    pub file: Option<PathBuf>,
+    #[serde(default)]
+    pub mode: Transfer,
 }
 
 /// How a value is transferred.
@@ -103,7 +137,8 @@ pub fn parse(tail: &[u8]) -> Result<Request, (u32, String)> {
     let job: Value =
         serde_json::from_slice(tail).map_err(|e| (FAILED, format!("the job is no JSON: {e}")))?;
     let what = job.get("do").and_then(Value::as_str).unwrap_or_default().to_owned();
-    const KNOWN: [&str; 5] = ["sdo_read", "sdo_write", "nmt", "boot", "status"];
+    const KNOWN: [&str; 9] =
+        ["sdo_read", "sdo_write", "nmt", "boot", "boot_state", "lss", "emcy", "emcy_clear", "status"];
     if !KNOWN.contains(&what.as_str()) {
         let known = KNOWN.join(", ");
         return Err((
@@ -135,12 +170,12 @@ mod tests {
         let ok = |text: &str| parse(text.as_bytes()).unwrap();
         assert_eq!(
             ok(r#"{"do":"sdo_read","node":5,"object":"1018:01"}"#),
-            Request::SdoRead {
+            Request::SdoRead(SdoRead {
                 node: 5,
                 object: "1018:01".parse().unwrap(),
                 mode: Transfer::Auto,
                 file: None
-            }
+            })
         );
         assert_eq!(
             ok(r#"{"do":"nmt","node":0,"command":"reset_communication"}"#),

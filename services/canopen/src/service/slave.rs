@@ -1,43 +1,51 @@
 //! The service `canopen-slave`: rail ports, clocks, the loop.
 
-use super::outputs::{Unsafe, gather, judge};
-use super::{
-    BEAT, EVENTS_A_SECOND, REPEAT_NS, RunError, STATUS_BEATS, TAKE_FRAMES, addressing_near, load,
-    no_only_bus, plc_of,
-};
-use crate::config::{SafeOn, SlaveConfig as Config};
+mod jobs;
+
+use super::job_port::JobPort;
+use super::ports::Ports;
+use super::{EVENTS_A_SECOND, RunError, TAKE_FRAMES, addressing_near, load, plc_of};
+use crate::config::SlaveConfig as Config;
 use crate::device::Device;
 use crate::mistakes::Mistakes;
 use crate::protocol::cob_id::predefined;
 use crate::protocol::emcy::register;
 use crate::protocol::io::Outbox;
+use crate::protocol::lss::BIT_TIMING_KBIT;
 use crate::protocol::lss::slave::LssSlaveEvent;
 use crate::protocol::nmt::NmtState;
 use crate::protocol::node::{Node, NodeEvent, NodeParams};
+use crate::protocol::time_stamp::TimeOfDay;
 use crate::slave::image_map::{self, ImageMap};
 use crate::slave::{drop_synchronous, is_late_sync, simulation};
 use dinrail_iec::Addressing;
-use ipc_types::event::{EventKind, Level};
-use ipc_types::inbox::Inbox;
-use ipc_types::payload::{CanFrame, Image, Inputs, can_flag};
-use ipc_types::port::{Publisher, SendError, Subscriber};
-use ipc_types::reactor::{Reactor, Wake};
-use ipc_types::stack::{ServiceEntry, Severity};
+use ipc_types::can_queue::Handed;
+use ipc_types::event::{Budget, EventKind, Level};
+use ipc_types::outputs::{Change, Guard, SafeOn, Words, gather};
+use ipc_types::payload::{CanFrame, Inputs, can_flag};
+use ipc_types::port::Subscriber;
+use ipc_types::stack::ServiceEntry;
 use ipc_types::topic::TopicKind;
+use ipc_types::turns::Turns;
+use ipc_types::units::BitRate;
 use ipc_types::wiring::{Neighbours, TopicDecl};
 use ipc_types::{Context, Finding, Stack, Wiring, clock, plc_table};
+use jobs::Errors;
 use serde_json::{Value, json};
-use std::collections::VecDeque;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-/// Frames that wait for room in the driver's queue; more are dropped and counted.
-const MAX_WAITING: usize = 1024;
-/// A full queue of the driver is tried again after this time.
-const RETRY_NS: u64 = 1_000_000;
 /// Emergency code of this device: its process image is not alive (CiA 301 V4.2, table 26: FF00h, device specific).
 const EMCY_IMAGE: u16 = 0xFF10;
-/// A node-id that LSS has yet to give (CiA 305 V3.0, 4.3.3).
+/// What the device does when its image is not alive.
+const WORDS: Words =
+    Words { entered: "the device reports an error to the network", left: "the device works again" };
+/// Jobs that can wait, and bytes of one and of its result.
+const MAX_JOBS: u32 = 8;
+const JOB_BYTES: u32 = 512;
+/// Bit rate of a bus whose table names none.
+const DEFAULT_BITRATE: BitRate = BitRate(500_000);
+/// A node-id that LSS has yet to give (CiA 305 V3.0).
 const UNCONFIGURED: u8 = 255;
 
 fn planned(config: &Config, dir: &Path, addressing: Addressing) -> (Option<Device>, ImageMap, Mistakes) {
@@ -70,6 +78,10 @@ pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
     if map.ranges() > 0 {
         wiring.topics.push(TopicDecl::new(TopicKind::Inputs).max_tail(map.tail().len() as u32));
     }
+    // A device may be one of many: small queues.
+    wiring.topics.push(TopicDecl::new(TopicKind::Jobs).depth(MAX_JOBS).max_tail(JOB_BYTES));
+    wiring.topics.push(TopicDecl::new(TopicKind::Results).depth(MAX_JOBS).max_tail(JOB_BYTES));
+    wiring.read(TopicKind::Jobs.of(&neighbours.name), true, "");
     if let Some(bus) = neighbours.resolve("can", config.bus.as_deref()) {
         wiring.read(TopicKind::CanRx.of(&bus), true, "bus");
         wiring.write(TopicKind::CanTx.of(&bus), "bus");
@@ -93,16 +105,9 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
     let name = &me.name;
     let (plc, addressing) = plc_of(stack, &me.wiring);
     let (_, _, mistakes) = planned(config, &stack.dir, addressing);
-    let mut found: Vec<Finding> = mistakes
-        .0
-        .iter()
-        .map(|m| Finding {
-            severity: if m.warning { Severity::Warning } else { Severity::Error },
-            ..Finding::error(name, &m.key, &m.message, &m.help)
-        })
-        .collect();
+    let mut found: Vec<Finding> = mistakes.0.iter().map(|m| m.finding(name)).collect();
     if config.bus.is_none() {
-        found.extend(no_only_bus(stack, name));
+        found.extend(stack.check_only(name, "bus", "can"));
     }
     if !me.wiring.outputs.is_empty() {
         found.extend(plc.and_then(|plc| plc_table::check_stale_after(name, config.stale_after, plc)));
@@ -139,6 +144,16 @@ impl Keep {
     }
 }
 
+/// The bit rates that LSS may choose, as bits of its table: the one of the bus, which its driver owns.
+fn bit_timing(stack: &Stack, wiring: &Wiring) -> u16 {
+    let bus = wiring.writes.first().and_then(|(topic, _)| topic.split('/').next());
+    let can = bus.and_then(|bus| stack.service(bus));
+    let text = can.and_then(|can| can.config.get("bitrate")).and_then(Value::as_str);
+    let rate = text.map_or(DEFAULT_BITRATE, |text| text.parse().unwrap_or(DEFAULT_BITRATE));
+    let index = BIT_TIMING_KBIT.iter().position(|&kbit| kbit > 0 && u32::from(kbit) * 1000 == rate.0);
+    index.map_or(0, |index| 1 << index)
+}
+
 /// Runs until the launcher says stop.
 pub fn run(mut ctx: Context) -> Result<(), RunError> {
     let config: Config = ctx.config()?;
@@ -153,7 +168,7 @@ pub fn run(mut ctx: Context) -> Result<(), RunError> {
     let keep = Keep { file: config.store.as_ref().map(|f| ctx.stack.dir.join(f)) };
     let mut params = NodeParams::new(keep.node_id().unwrap_or(config.node_id));
     if let Some(lss) = &mut params.lss {
-        (lss.store, lss.bit_timing) = (config.store.is_some(), 0);
+        (lss.store, lss.bit_timing) = (config.store.is_some(), bit_timing(&ctx.stack, &wiring));
     }
     let serial = device.od.u32(0x1018, 4);
     let node = match Node::new(device.od.clone(), params, &keep.objects()) {
@@ -165,53 +180,30 @@ pub fn run(mut ctx: Context) -> Result<(), RunError> {
             Node::new(device.od, params, &[]).map_err(|e| refused("node_id", e.to_string()))?
         }
     };
-    let read =
-        |suffix: &str| wiring.reads.iter().find(|r| r.topic.ends_with(suffix)).map(|r| r.topic.clone());
-    let rx = read("/rx").map(|topic| ctx.subscriber(&topic)).transpose()?;
-    let image = read("/image").map(|topic| ctx.subscriber(&topic)).transpose()?;
-    let tx = wiring.writes.first().map(|(topic, _)| ctx.publisher(topic)).transpose()?;
-    let name = ctx.service.clone();
-    let published = if map.ranges() == 0 { None } else { Some(ctx.publisher(&TopicKind::Inputs.of(&name))?) };
-    let mut inbox = ctx.inbox()?;
-    let mut reactor = Reactor::new()?;
-    let wakes = Wakes {
-        inbox: reactor.add(inbox.fd())?,
-        stop: reactor.add(ctx.shutdown_fd())?,
-        beat: reactor.add_timer(BEAT)?,
-        alarm: reactor.add_alarm()?,
-    };
+    let guard = Guard::new(config.stale_after, &SafeOn::ALL);
+    let ports = Ports::open(&mut ctx, &wiring, guard)?;
+    let jobs = JobPort::open(&mut ctx)?;
+    let turns = Turns::new(ctx.inbox()?, ctx.shutdown_fd())?;
     let mut service = Service {
-        unechoed: 0,
-        serial,
-        gathered: vec![0; map.gathered_bytes()],
-        safe: image.is_some().then_some(Unsafe::Waiting),
         ctx,
         config,
+        unechoed: 0,
+        serial,
         node,
+        gathered: vec![0; map.gathered_bytes()],
         map,
         keep,
-        rx,
-        image,
-        tx,
-        published,
+        ports,
+        jobs,
+        errors: Errors::default(),
+        silent_until_ns: 0,
+        time: None,
         out: Outbox::default(),
-        waiting: VecDeque::with_capacity(MAX_WAITING),
-        dropped: 0,
-        published_ns: 0,
         data_t_ns: 0,
-        image_ns: 0,
-        event_budget: EVENTS_A_SECOND,
-        events_left_out: 0,
+        events: Budget::new(EVENTS_A_SECOND),
     };
     service.begin();
-    service.work(&mut reactor, &mut inbox, &wakes)
-}
-
-struct Wakes {
-    inbox: Wake,
-    stop: Wake,
-    beat: Wake,
-    alarm: Wake,
+    service.work(turns)
 }
 
 struct Service {
@@ -224,20 +216,17 @@ struct Service {
     node: Node,
     map: ImageMap,
     keep: Keep,
-    rx: Option<Subscriber<CanFrame>>,
-    image: Option<Subscriber<Image>>,
-    tx: Option<Publisher<CanFrame>>,
-    published: Option<Publisher<Inputs>>,
+    ports: Ports,
+    jobs: JobPort,
+    errors: Errors,
+    /// The bit timing is being activated: neither sends nor hears until then.
+    silent_until_ns: u64,
+    /// The last TIME message it consumed.
+    time: Option<TimeOfDay>,
     gathered: Vec<u8>,
     out: Outbox,
-    waiting: VecDeque<CanFrame>,
-    dropped: u64,
-    published_ns: u64,
     data_t_ns: u64,
-    image_ns: u64,
-    safe: Option<Unsafe>,
-    event_budget: u32,
-    events_left_out: u32,
+    events: Budget,
 }
 
 impl Service {
@@ -249,66 +238,42 @@ impl Service {
         self.status();
     }
 
-    fn work(&mut self, reactor: &mut Reactor, inbox: &mut Inbox, wakes: &Wakes) -> Result<(), RunError> {
-        let mut beats = 0u32;
-        let mut alarm_ns = None;
+    fn work(&mut self, mut turns: Turns) -> Result<(), RunError> {
         loop {
-            let (mut rang, mut beat) = (false, false);
-            for &wake in reactor.wait(None)? {
-                rang |= wake == wakes.inbox;
-                beat |= wake == wakes.beat;
-                if wake == wakes.alarm {
-                    alarm_ns = None;
-                }
-                if wake == wakes.stop {
-                    return Ok(());
-                }
+            let due = turns.wait()?;
+            if due.stop {
+                return Ok(());
             }
-            if rang {
-                inbox.drain();
-            }
+            turns.drain();
             let more = self.take_frames();
             self.take_image();
+            self.take_jobs();
             let now_ns = clock::mono_ns();
-            self.watch(now_ns);
+            let change = self.ports.image.on_time(now_ns);
+            self.follow(change);
             self.node.on_time(now_ns, &mut self.out);
             self.after(now_ns);
-            if beat {
-                beats += 1;
+            if due.beat {
                 self.ctx.beat();
-                if now_ns.saturating_sub(self.published_ns) >= REPEAT_NS {
+                if self.ports.inputs.is_due(now_ns) {
                     self.publish(false);
                 }
-                if beats.is_multiple_of(STATUS_BEATS) {
-                    self.status();
-                }
             }
-            if let Some(next_ns) = self.next_ns(now_ns, more)
-                && alarm_ns != Some(next_ns)
-            {
-                reactor.set_alarm(wakes.alarm, next_ns)?;
-                alarm_ns = Some(next_ns);
+            if due.status {
+                self.status();
             }
+            let next_ns = self.ports.next_ns(now_ns, more, self.node.next_deadline());
+            turns.come_again(next_ns)?;
         }
-    }
-
-    fn next_ns(&self, now_ns: u64, more: bool) -> Option<u64> {
-        if more {
-            return Some(now_ns);
-        }
-        let watched = self.image.is_some() && self.safe.is_none();
-        let stale_ns = watched.then(|| self.image_ns.saturating_add(self.config.stale_after.ns()));
-        let retry_ns = (!self.waiting.is_empty()).then(|| now_ns.saturating_add(RETRY_NS));
-        let next = self.node.next_deadline().into_iter().chain(stale_ns).chain(retry_ns).min();
-        next.map(|at_ns| at_ns.max(now_ns + 1))
     }
 
     /// Takes frames of the bus; true when more may wait.
     fn take_frames(&mut self) -> bool {
-        let Some(mut rx) = self.rx.take() else { return false };
+        let Some(mut rx) = self.ports.rx.take() else { return false };
         let mut last_ns = 0;
         let taken = rx.drain(TAKE_FRAMES, |frame, _| {
-            if frame.fault().is_none() && !self.is_own(frame) {
+            let hears = frame.stamp.t_ns >= self.silent_until_ns;
+            if frame.fault().is_none() && !self.is_own(frame) && hears {
                 last_ns = frame.stamp.t_ns;
                 self.node.on_frame(frame.stamp.t_ns, frame, &mut self.out);
                 self.react(frame.stamp.t_ns);
@@ -317,7 +282,7 @@ impl Service {
                 }
             }
         });
-        self.rx = Some(rx);
+        self.ports.rx = Some(rx);
         if last_ns > 0 {
             self.data_t_ns = last_ns;
         }
@@ -340,7 +305,7 @@ impl Service {
         self.react(now_ns);
         self.send();
         let good = self.node.state() == NmtState::Operational;
-        if self.published.is_some() && self.map.collect(&self.node, good) {
+        if self.ports.inputs.is_open() && self.map.collect(&self.node, good) {
             self.publish(true);
         }
     }
@@ -352,6 +317,7 @@ impl Service {
             }
             match event {
                 NodeEvent::Reset { .. } => {
+                    self.errors.forget();
                     if let Some(serial) = self.serial {
                         let _ = self.node.write(t_ns, 0x1018, 4, &serial.to_le_bytes(), &mut self.out);
                     }
@@ -360,6 +326,11 @@ impl Service {
                 }
                 NodeEvent::StoreChanged => self.store(t_ns),
                 NodeEvent::Lss(LssSlaveEvent::Store { node_id, .. }) => self.store_lss(node_id),
+                NodeEvent::Lss(LssSlaveEvent::ActivateBitTiming { delay_ms, .. }) => {
+                    // The only bit rate it takes is the one the bus has: what is left are the pauses (CiA 305 V3.0, 6.4.4).
+                    self.silent_until_ns = t_ns.saturating_add(2 * u64::from(delay_ms) * 1_000_000);
+                }
+                NodeEvent::Time(time) => self.time = Some(time),
                 other => self.tell(&other),
             }
         }
@@ -383,12 +354,9 @@ impl Service {
             }
             _ => return,
         };
-        if self.event_budget == 0 {
-            self.events_left_out += 1;
-            return;
+        if self.events.take() {
+            self.ctx.event(kind, level, text, Value::Null);
         }
-        self.event_budget -= 1;
-        self.ctx.event(kind, level, text, Value::Null);
     }
 
     fn store(&mut self, t_ns: u64) {
@@ -409,129 +377,56 @@ impl Service {
         }
     }
 
-    /// Hands frames to the driver, in order; what finds no room waits.
     fn send(&mut self) {
-        let Some(tx) = &mut self.tx else { return };
-        for frame in self.out.drain() {
-            if self.waiting.len() < MAX_WAITING {
-                self.waiting.push_back(frame);
-            } else {
-                self.dropped += 1;
-            }
+        if clock::mono_ns() < self.silent_until_ns {
+            self.out.drain().for_each(drop);
         }
-        let mut any = false;
-        while let Some(frame) = self.waiting.front() {
-            match tx.send(*frame) {
-                Ok(_) => {
-                    any = true;
-                    let error_control = predefined::ERROR_CONTROL + u32::from(self.node.node_id());
-                    self.unechoed += u32::from(frame.can_id == error_control);
-                    self.waiting.pop_front();
-                }
-                // The driver is away or busy: old frames are of no use to anybody.
-                Err(SendError::NoReader(_)) => {
-                    self.dropped += self.waiting.len() as u64;
-                    self.waiting.clear();
-                    self.unechoed = 0;
-                }
-                Err(SendError::Full(_)) => break,
-                Err(e) => {
-                    tracing::warn!("frame {:03X}: {e}", frame.id());
-                    self.waiting.pop_front();
-                }
-            }
-        }
-        if any {
-            tx.ring();
+        let own = predefined::ERROR_CONTROL + u32::from(self.node.node_id());
+        let unechoed = &mut self.unechoed;
+        let sent = |frame: &CanFrame| *unechoed += u32::from(frame.can_id == own);
+        if self.ports.send(&mut self.out, sent) == Handed::Dropped {
+            // The driver is away, and with it the echoes it owes.
+            self.unechoed = 0;
         }
     }
 
     /// `fresh`: news, so the plc is woken; otherwise a repetition.
     fn publish(&mut self, fresh: bool) {
-        let Some(port) = &mut self.published else { return };
         let header = Inputs { data_t_ns: self.data_t_ns, ranges: self.map.ranges(), ..Inputs::default() };
-        if let Err(e) = port.send_tail(header, self.map.tail()) {
-            tracing::warn!("inputs: {e}");
-        }
-        if fresh {
-            port.ring();
-        }
-        self.published_ns = clock::mono_ns();
+        self.ports.inputs.publish(header, self.map.tail(), fresh);
     }
 
     fn take_image(&mut self) {
-        let Some(port) = &mut self.image else { return };
-        let (ranges, gathered) = (&self.map.output_ranges, &mut self.gathered);
-        let stale_ns = self.config.stale_after.ns();
-        let mut verdict = None;
-        let mut image_ns = self.image_ns;
-        port.newest(|image, tail| {
-            let Some((_, q, m)) = image.areas(tail) else { return };
-            image_ns = image.stamp.t_ns;
-            let why = judge(image.plc_state(), image.scan, &[SafeOn::Stop, SafeOn::Fault, SafeOn::Halted]);
-            let fresh = clock::mono_ns().saturating_sub(image_ns) <= stale_ns;
-            let why = why.or((!fresh).then_some(Unsafe::Stale));
-            if why.is_none() {
-                gather(ranges, q, m, gathered);
-            }
-            verdict = Some(why);
+        let Self { map, node, gathered, out, ports, .. } = self;
+        let change = ports.image.take(|q, m| {
+            gather(&map.output_ranges, q, m, gathered);
+            map.apply(clock::mono_ns(), node, gathered, out);
         });
-        self.image_ns = image_ns;
-        if let Some(why) = verdict {
-            if why.is_none() {
-                self.map.apply(clock::mono_ns(), &mut self.node, &self.gathered, &mut self.out);
-            }
-            self.set_safe(why);
-        }
-    }
-
-    /// Notices an image that stopped coming.
-    fn watch(&mut self, now_ns: u64) {
-        let age_ns = now_ns.saturating_sub(self.image_ns);
-        if self.image.is_some() && self.safe.is_none() && age_ns > self.config.stale_after.ns() {
-            self.set_safe(Some(Unsafe::Stale));
-        }
+        self.follow(change);
     }
 
     /// The device tells the network that nobody drives it, and does as 1029h says.
-    fn set_safe(&mut self, why: Option<Unsafe>) {
-        if self.safe == why {
-            return;
-        }
-        let was = std::mem::replace(&mut self.safe, why);
+    fn follow(&mut self, change: Option<Change>) {
+        let Some(change) = change else { return };
         let now_ns = clock::mono_ns();
-        match (was, why) {
+        match (change.was, change.why) {
             (None, Some(why)) => {
-                self.node.raise(
-                    now_ns,
-                    EMCY_IMAGE,
-                    0,
-                    register::GENERIC,
-                    [why as u8, 0, 0, 0, 0],
-                    &mut self.out,
-                );
+                let info = [why as u8, 0, 0, 0, 0];
+                self.node.raise(now_ns, EMCY_IMAGE, 0, register::GENERIC, info, &mut self.out);
                 self.node.device_failed(now_ns, &mut self.out);
-                let message = format!("the device reports an error to the network: {}", why.text());
-                self.ctx.event(EventKind::SafeEntered, why.level(), message, json!({ "why": why }));
             }
-            (Some(was), None) => {
-                self.node.clear(now_ns, EMCY_IMAGE, 0, &mut self.out);
-                if was != Unsafe::Waiting {
-                    let message = "the device works again";
-                    self.ctx.event(EventKind::SafeLeft, Level::Info, message, Value::Null);
-                }
-            }
+            (Some(_), None) => self.node.clear(now_ns, EMCY_IMAGE, 0, &mut self.out),
             _ => {}
         }
+        change.tell(&mut self.ctx, &WORDS);
         self.send();
     }
 
     fn status(&mut self) {
-        if self.events_left_out > 0 {
-            let message = format!("{} more events in the last second left out", self.events_left_out);
+        if let Some(left_out) = self.events.renew() {
+            let message = format!("{left_out} more events in the last second left out");
             self.ctx.event(EventKind::NodeState, Level::Warning, message, Value::Null);
         }
-        (self.event_budget, self.events_left_out) = (EVENTS_A_SECOND, 0);
         let history: Vec<String> =
             self.node.error_history().iter().take(8).map(|e| format!("{e:08X}h")).collect();
         let status = json!({
@@ -539,10 +434,11 @@ impl Service {
             "state": self.node.state().name(),
             "error_register": self.node.error_register(),
             "errors": history,
-            "frames_dropped": self.dropped,
-            "frames_waiting": self.waiting.len(),
-            "safe": self.safe,
-            "rx": self.rx.as_ref().map(Subscriber::counters),
+            "time_utc_ms": self.time.map(TimeOfDay::unix_ms),
+            "frames_dropped": self.ports.queue.dropped(),
+            "frames_waiting": self.ports.queue.len(),
+            "safe": self.ports.image.why(),
+            "rx": self.ports.rx.as_ref().map(Subscriber::counters),
         });
         self.ctx.status(&status);
     }

@@ -178,7 +178,7 @@ impl ImageMap {
 
     /// Puts gathered outputs into the objects; what changed is an event of the device's transmit PDOs.
     pub fn apply(&mut self, t_ns: u64, node: &mut Node, gathered: &[u8], out: &mut Outbox) {
-        // First all values, then the events: a PDO of several objects goes out whole.
+        // First all values, then the event: a PDO of several objects goes out whole, and once.
         self.changed.clear();
         for point in &self.outputs {
             let Some(value) = gathered.get(point.at..point.at + point.bytes) else { continue };
@@ -189,8 +189,6 @@ impl ImageMap {
                 self.changed.push((point.index, point.sub));
             }
         }
-        for &(index, sub) in &self.changed {
-            node.changed(t_ns, index, sub, out);
-        }
+        node.changed(t_ns, &self.changed, out);
     }
 }

@@ -20,16 +20,18 @@ impl Alarm {
         Ok(Self { fd: readable::watch(fd)?, set_ns: None })
     }
 
-    /// Rings once at this CLOCK_MONOTONIC time in ns, at once when it is past; `None`: not at all.
+    /// Rings once at this CLOCK_MONOTONIC time in ns, at once when it is past; `None`: it need not ring. It may ring
+    /// at an earlier time that it was set to before: most are set for a timeout that does not come to pass, and
+    /// one ring too many costs less than a call to the system for every request. So set it after each ring.
     pub fn set(&mut self, at_ns: Option<u64>) -> io::Result<()> {
-        if self.set_ns == at_ns {
+        let Some(at_ns) = at_ns.filter(|at_ns| self.set_ns.is_none_or(|set_ns| *at_ns < set_ns)) else {
             return Ok(());
-        }
-        let at = at_ns.map_or(0, |ns| ns.max(1));
+        };
+        let at = at_ns.max(1);
         let value = Timespec { tv_sec: (at / 1_000_000_000) as i64, tv_nsec: (at % 1_000_000_000) as i64 };
         let once = Itimerspec { it_interval: Timespec { tv_sec: 0, tv_nsec: 0 }, it_value: value };
         timerfd_settime(self.fd.get_ref(), TimerfdTimerFlags::ABSTIME, &once)?;
-        self.set_ns = at_ns;
+        self.set_ns = Some(at_ns);
         Ok(())
     }
 
@@ -58,13 +60,16 @@ mod tests {
     use ipc_types::clock::mono_ns;
 
     #[test]
-    fn it_rings_not_before_its_time_and_again() {
+    fn it_rings_at_the_earliest_of_its_times_and_again() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().unwrap();
         runtime.block_on(async {
             let mut alarm = Alarm::new().unwrap();
             for ms in [5, 0, 3] {
                 let at_ns = mono_ns() + ms * 1_000_000;
-                alarm.set(Some(at_ns)).unwrap();
+                // An hour is no time that a test waits for.
+                for set_ns in [Some(at_ns + 3_600_000_000_000), Some(at_ns), None, Some(at_ns + 1)] {
+                    alarm.set(set_ns).unwrap();
+                }
                 alarm.rang().await.unwrap();
                 assert!(mono_ns() >= at_ns);
             }

@@ -1,7 +1,9 @@
 //! The service's table of the stack file.
 
+use super::line::UnitSettings;
 use super::order::Order;
 use crate::server::Table;
+use ipc_types::outputs::{STALE_AFTER, SafeOn};
 use ipc_types::units::Span;
 use serde::{Deserialize, Serialize};
 use std::net::SocketAddr;
@@ -77,22 +79,13 @@ impl Default for Config {
             max_gap: 8,
             max_batch: 125,
             connect_timeout: Span::from_ms(2000),
-            stale_after: Span::from_ms(200),
-            safe_on: vec![SafeOn::Stop, SafeOn::Fault, SafeOn::Halted],
+            stale_after: STALE_AFTER,
+            safe_on: SafeOn::ALL.to_vec(),
             units: Vec::new(),
             reads: Vec::new(),
             writes: Vec::new(),
         }
     }
-}
-
-/// States of the plc in which writes go to their safe state.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum SafeOn {
-    Stop,
-    Fault,
-    Halted,
 }
 
 /// A unit: its number, or the name a `[[service.unit]]` gave it.
@@ -261,6 +254,18 @@ pub struct Write {
     /// Safe state: nothing is written any more. Or these values, once: one a value of the range.
     #[serde(default)]
     pub safe_values: Option<Vec<f64>>,
+}
+
+impl Config {
+    /// What is true for every unit that says nothing else.
+    pub fn unit_settings(&self) -> UnitSettings {
+        UnitSettings {
+            response_timeout_ns: self.response_timeout.ns(),
+            retries: self.retries,
+            probe_min_ns: self.probe_min.ns(),
+            probe_max_ns: self.probe_max.ns(),
+        }
+    }
 }
 
 fn default_period() -> Span {

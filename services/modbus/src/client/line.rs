@@ -17,13 +17,17 @@
 use crate::protocol::client_fit::{Fit, fit};
 use std::collections::VecDeque;
 
+mod outcome;
+mod schedule;
 mod types;
+mod unit;
 
 use types::Pdu;
 pub use types::{
     Failure, LineCounters, Origin, QueueFull, Settings, SlotKind, Step, UnitCounters, UnitSettings,
     UnitState, UnitView,
 };
+use unit::Unit;
 
 /// Most jobs that wait for a line.
 pub const MAX_JOBS: usize = 64;
@@ -35,74 +39,6 @@ pub const LONE_PROBE_NS: u64 = 5_000_000_000;
 const WRITES_IN_A_ROW: u32 = 8;
 /// Shortest and longest pause after the port or connection failed.
 const LINK_PAUSE_NS: (u64, u64) = (100_000_000, 5_000_000_000);
-
-struct Unit {
-    number: u8,
-    settings: UnitSettings,
-    state: UnitState,
-    /// The request that is being repeated: nothing else goes to the unit.
-    retrying: Option<Origin>,
-    failed_ns: u64,
-    level: u32,
-    /// Line time of the tries since the unit was last well, of the last failure when dead.
-    cost_ns: u64,
-    /// Requests whose late answers may still come.
-    suspects: [Suspect; SUSPECTS],
-    counters: UnitCounters,
-    last_exception: Option<u8>,
-    last_rtt_ns: Option<u64>,
-    max_rtt_ns: u64,
-}
-
-/// Requests of a unit that are remembered because of their late answers.
-const SUSPECTS: usize = 4;
-
-#[derive(Clone, Copy)]
-struct Suspect {
-    pdu: Pdu,
-    until_ns: u64,
-    /// Answers that may still come.
-    outstanding: u8,
-    /// A repetition was answered, by whichever answer: not even the same request goes out before the other one came.
-    answered: bool,
-}
-
-impl Unit {
-    /// A request was given up; its answer may come until then.
-    fn suspect(&mut self, pdu: &Pdu, now_ns: u64, until_ns: u64) {
-        let known = self.suspects.iter().position(|s| s.is_active(now_ns) && s.pdu.get() == pdu.get());
-        let at = known.unwrap_or_else(|| {
-            (0..SUSPECTS)
-                .min_by_key(|&i| (self.suspects[i].outstanding > 0, self.suspects[i].until_ns))
-                .unwrap_or(0)
-        });
-        let outstanding = if known.is_some() { self.suspects[at].outstanding.saturating_add(1) } else { 1 };
-        self.suspects[at] = Suspect { pdu: *pdu, until_ns, outstanding, answered: false };
-    }
-
-    /// A frame was discarded: if it is a late answer, that one has come.
-    fn discarded(&mut self, answer: &[u8]) {
-        self.counters.discarded += 1;
-        let late = |s: &&mut Suspect| s.outstanding > 0 && fit(s.pdu.get(), answer) != Fit::No;
-        if let Some(suspect) = self.suspects.iter_mut().find(late) {
-            suspect.outstanding -= 1;
-        }
-    }
-
-    /// A repeated request was answered, perhaps by the late answer to an earlier try: then its own is still to come.
-    fn answered(&mut self, pdu: &Pdu, now_ns: u64, until_ns: u64) {
-        for suspect in self.suspects.iter_mut().filter(|s| s.is_active(now_ns) && s.pdu.get() == pdu.get()) {
-            suspect.until_ns = suspect.until_ns.max(until_ns);
-            suspect.answered = true;
-        }
-    }
-}
-
-impl Suspect {
-    fn is_active(&self, now_ns: u64) -> bool {
-        self.outstanding > 0 && self.until_ns > now_ns
-    }
-}
 
 struct Slot {
     unit: usize,
@@ -310,21 +246,7 @@ impl Line {
             return known;
         }
         self.index[usize::from(unit)] = self.units.len() as u16;
-        self.units.push(Unit {
-            number: unit,
-            settings: self.default_unit,
-            state: UnitState::Unknown,
-            retrying: None,
-            failed_ns: 0,
-            level: 0,
-            cost_ns: 0,
-            suspects: [Suspect { pdu: Pdu::new(&[]), until_ns: 0, outstanding: 0, answered: false };
-                SUSPECTS],
-            counters: UnitCounters::default(),
-            last_exception: None,
-            last_rtt_ns: None,
-            max_rtt_ns: 0,
-        });
+        self.units.push(Unit::new(unit, self.default_unit));
         self.units.len() - 1
     }
 
@@ -404,129 +326,6 @@ impl Line {
         }
     }
 
-    /// The port or connection does not work: what is in flight fails, and nothing is sent for a while.
-    pub fn link_failed(&mut self, now_ns: u64) {
-        self.counters.link_failures += 1;
-        let pause = (LINK_PAUSE_NS.0 << self.link_level.min(10)).min(LINK_PAUSE_NS.1);
-        self.link_level += 1;
-        self.link_until_ns = now_ns.saturating_add(pause);
-        if let Some(flight) = self.flight.take() {
-            self.forget_retry(flight.origin);
-            self.rest(flight.origin, now_ns);
-            self.ended = Some((flight.origin, flight.unit, Ended::Failed(Failure::Link)));
-        }
-    }
-
-    fn forget_retry(&mut self, origin: Origin) {
-        for unit in &mut self.units {
-            if unit.retrying == Some(origin) {
-                unit.retrying = None;
-            }
-        }
-        if let Origin::Slot(i) = origin
-            && let Some(slot) = self.slots.get_mut(i)
-        {
-            slot.tries = 0;
-        }
-    }
-
-    fn succeed(&mut self, len: usize, now_ns: u64) {
-        let Some(flight) = self.flight.take() else { return };
-        let rtt_ns = now_ns.saturating_sub(flight.sent_ns.max(flight.begun_ns));
-        let unit = &mut self.units[flight.unit];
-        let timeout_ns = unit.settings.response_timeout_ns;
-        unit.answered(&flight.pdu, now_ns, flight.sent_ns.saturating_add(2 * timeout_ns));
-        let was_dead = unit.state == UnitState::Dead;
-        unit.state = UnitState::Ok;
-        (unit.level, unit.cost_ns) = (0, 0);
-        unit.counters.answers += 1;
-        unit.last_rtt_ns = Some(rtt_ns);
-        unit.max_rtt_ns = unit.max_rtt_ns.max(rtt_ns);
-        self.link_level = 0;
-        self.forget_retry(flight.origin);
-        self.rest(flight.origin, now_ns);
-        if was_dead {
-            for slot in self.slots.iter_mut().filter(|s| s.unit == flight.unit && s.enabled) {
-                if slot.kind == SlotKind::Read && slot.due_ns.is_none_or(|due_ns| due_ns > now_ns) {
-                    slot.due_ns = Some(now_ns);
-                }
-            }
-        }
-        self.ended = Some((flight.origin, flight.unit, Ended::Answer(len)));
-    }
-
-    /// Puts a slot back into the schedule after its turn, whatever came of it.
-    fn rest(&mut self, origin: Origin, now_ns: u64) {
-        let Origin::Slot(i) = origin else { return };
-        let slot = &mut self.slots[i];
-        match slot.kind {
-            SlotKind::Read => {
-                let period_ns = slot.period_ns.unwrap_or(0);
-                let planned = slot.due_ns.unwrap_or(now_ns).saturating_add(period_ns);
-                slot.due_ns = Some(planned.max(now_ns));
-                if planned < now_ns && period_ns > 0 {
-                    self.counters.missed_periods += (now_ns - planned) / period_ns;
-                }
-            }
-            SlotKind::Write => {
-                if slot.changed {
-                    slot.due_ns = Some(now_ns);
-                } else {
-                    slot.due_ns = None;
-                }
-            }
-        }
-    }
-
-    /// The try in flight has failed: repeated, or told.
-    fn fail(&mut self, failure: Failure, now_ns: u64) {
-        let Some(flight) = self.flight.take() else { return };
-        let spent_ns = now_ns.saturating_sub(flight.begun_ns);
-        let unit = &mut self.units[flight.unit];
-        unit.counters.timeouts += u64::from(failure == Failure::NoAnswer);
-        let was_dead = unit.state == UnitState::Dead;
-        unit.cost_ns = if was_dead { spent_ns } else { unit.cost_ns.saturating_add(spent_ns) };
-        if self.settings.serial && failure == Failure::NoAnswer && !flight.damaged {
-            let until_ns = now_ns.saturating_add(unit.settings.response_timeout_ns);
-            unit.suspect(&flight.pdu, now_ns, until_ns);
-        }
-        let retries = if was_dead { 0 } else { unit.settings.retries };
-        let tries = match flight.origin {
-            Origin::Slot(i) => {
-                self.slots[i].tries += 1;
-                self.slots[i].tries
-            }
-            // Jobs in flight stand first in the queue.
-            Origin::Job(_) => self.jobs.front_mut().map_or(u8::MAX, |job| {
-                job.tries += 1;
-                job.tries
-            }),
-        };
-        if tries <= retries {
-            unit.state = UnitState::Failing;
-            unit.retrying = Some(flight.origin);
-            if let Origin::Slot(i) = flight.origin
-                && self.slots[i].due_ns.is_some()
-            {
-                // Behind those that are due already.
-                self.slots[i].due_ns = Some(now_ns);
-            }
-            return;
-        }
-        unit.state = UnitState::Dead;
-        unit.failed_ns = now_ns;
-        unit.level = unit.level.saturating_add(1);
-        self.forget_retry(flight.origin);
-        match flight.origin {
-            // The newest value stays to be written when the unit is back.
-            Origin::Slot(i) if self.slots[i].kind == SlotKind::Write && self.slots[i].due_ns.is_some() => {
-                self.slots[i].due_ns = Some(now_ns);
-            }
-            origin => self.rest(origin, now_ns),
-        }
-        self.ended = Some((flight.origin, flight.unit, Ended::Failed(failure)));
-    }
-
     /// What to do now. To be called again until it says [`Step::Wait`], after everything that happened.
     pub fn step(&mut self, now_ns: u64) -> Step<'_> {
         self.expire(now_ns);
@@ -560,179 +359,6 @@ impl Line {
             Ok(origin) => self.send(origin, now_ns),
             Err(next_ns) => Step::Wait(next_ns),
         }
-    }
-
-    fn expire(&mut self, now_ns: u64) {
-        let Some(flight) = &self.flight else { return };
-        if now_ns < flight.until_ns {
-            return;
-        }
-        match flight.phase {
-            Phase::Sending => self.link_failed(now_ns),
-            Phase::Waiting => {
-                // The answer may still come, and there is no telling which one it is.
-                self.reset = !self.settings.serial;
-                self.fail(Failure::NoAnswer, now_ns);
-            }
-            Phase::Turnaround => {
-                if let Some(flight) = self.flight.take() {
-                    self.units[flight.unit].state = UnitState::Ok;
-                    self.forget_retry(flight.origin);
-                    self.rest(flight.origin, now_ns);
-                    self.ended = Some((flight.origin, flight.unit, Ended::Answer(0)));
-                }
-            }
-        }
-    }
-
-    /// Ends jobs that nobody waits for or that cannot be tried; one at a time, wherever they stand.
-    fn jobs_that_fail(&mut self, now_ns: u64) {
-        let in_flight = |job: &Job| self.flight.as_ref().is_some_and(|f| f.origin == Origin::Job(job.id));
-        let link_down = self.flight.is_none() && now_ns < self.link_until_ns;
-        let mut found = None;
-        for (i, job) in self.jobs.iter().enumerate() {
-            if in_flight(job) {
-                continue;
-            }
-            let failure = if now_ns >= job.deadline_ns {
-                Failure::Expired
-            } else if link_down {
-                Failure::Link
-            } else if job.fail_fast && job.tries == 0 && !self.may_probe(job.unit, now_ns) {
-                Failure::UnitDown
-            } else {
-                continue;
-            };
-            found = Some((i, failure));
-            break;
-        }
-        if let Some((i, failure)) = found
-            && let Some(job) = self.jobs.remove(i)
-        {
-            self.forget_retry(Origin::Job(job.id));
-            self.ended = Some((Origin::Job(job.id), job.unit, Ended::Failed(failure)));
-        }
-    }
-
-    /// When a dead unit is tried again.
-    fn probe_ns(&self, unit: &Unit) -> u64 {
-        let others = self.units.iter().enumerate().any(|(i, other)| {
-            other.number != unit.number
-                && other.state != UnitState::Dead
-                && self.slots.iter().any(|slot| slot.unit == i && slot.enabled)
-        }) || (self.slots.is_empty() && self.units.iter().any(|u| u.state == UnitState::Ok));
-        let grown = unit.settings.probe_min_ns << unit.level.saturating_sub(1).min(16);
-        let interval = if others {
-            let fair = unit.cost_ns.saturating_mul(PROBE_SHARE);
-            grown.min(unit.settings.probe_max_ns).max(fair)
-        } else {
-            grown.min(unit.settings.probe_max_ns.min(LONE_PROBE_NS))
-        };
-        unit.failed_ns.saturating_add(interval)
-    }
-
-    fn may_probe(&self, unit: usize, now_ns: u64) -> bool {
-        let unit = &self.units[unit];
-        unit.state != UnitState::Dead || self.probe_ns(unit) <= now_ns
-    }
-
-    /// When a request may go to its unit: now, or not before.
-    fn free_ns(&self, origin: Origin, unit: usize, pdu: &Pdu, patient: bool, now_ns: u64) -> Option<u64> {
-        let state = &self.units[unit];
-        if state.retrying.is_some_and(|other| other != origin) {
-            return None;
-        }
-        let mut free_ns = 0;
-        if state.state == UnitState::Dead && patient {
-            free_ns = self.probe_ns(state);
-        }
-        for suspect in state.suspects.iter().filter(|s| s.is_active(now_ns)) {
-            if suspect.pdu.confusable(pdu.get(), suspect.answered) {
-                free_ns = free_ns.max(suspect.until_ns);
-            }
-        }
-        Some(free_ns)
-    }
-
-    /// The request whose turn it is, or when there may be one.
-    fn choose(&self, now_ns: u64) -> Result<Origin, Option<u64>> {
-        let mut next_ns: Option<u64> = None;
-        let mut write: Option<(u64, usize)> = None;
-        let mut read: Option<(u64, usize)> = None;
-        for (i, slot) in self.slots.iter().enumerate() {
-            let Some(due_ns) = slot.due_ns.filter(|_| slot.enabled) else { continue };
-            let Some(free_ns) = self.free_ns(Origin::Slot(i), slot.unit, &slot.pdu, true, now_ns) else {
-                continue;
-            };
-            let at_ns = due_ns.max(free_ns);
-            if at_ns > now_ns {
-                next_ns = Some(next_ns.map_or(at_ns, |n| n.min(at_ns)));
-                continue;
-            }
-            let best = if slot.kind == SlotKind::Write { &mut write } else { &mut read };
-            if best.is_none_or(|(best_ns, _)| due_ns < best_ns) {
-                *best = Some((due_ns, i));
-            }
-        }
-        let mut job = None;
-        for (i, waiting) in self.jobs.iter().enumerate() {
-            next_ns = Some(next_ns.map_or(waiting.deadline_ns, |n| n.min(waiting.deadline_ns)));
-            let origin = Origin::Job(waiting.id);
-            match self.free_ns(origin, waiting.unit, &waiting.pdu, false, now_ns) {
-                Some(free_ns) if free_ns <= now_ns => {
-                    job = Some(i);
-                    break;
-                }
-                Some(free_ns) => next_ns = next_ns.map(|n| n.min(free_ns)),
-                None => {}
-            }
-        }
-        let turn_of_reads = self.writes_in_a_row >= WRITES_IN_A_ROW && (read.is_some() || job.is_some());
-        if let Some((_, i)) = write.filter(|_| !turn_of_reads) {
-            return Ok(Origin::Slot(i));
-        }
-        match (job, read) {
-            (Some(i), None) => Ok(Origin::Job(self.jobs[i].id)),
-            (Some(i), Some(_)) if !self.job_had_turn => Ok(Origin::Job(self.jobs[i].id)),
-            (_, Some((_, i))) => Ok(Origin::Slot(i)),
-            (None, None) => Err(next_ns),
-        }
-    }
-
-    fn send(&mut self, origin: Origin, now_ns: u64) -> Step<'_> {
-        let (unit, pdu, tries) = match origin {
-            Origin::Slot(i) => {
-                let slot = &mut self.slots[i];
-                slot.changed = false;
-                match slot.kind {
-                    SlotKind::Write => self.writes_in_a_row += 1,
-                    SlotKind::Read => (self.writes_in_a_row, self.job_had_turn) = (0, false),
-                }
-                (slot.unit, slot.pdu, slot.tries)
-            }
-            Origin::Job(id) => {
-                (self.writes_in_a_row, self.job_had_turn) = (0, true);
-                // The job in flight stands first.
-                let at = self.jobs.iter().position(|job| job.id == id).unwrap_or(0);
-                self.jobs.make_contiguous()[..=at].rotate_right(1);
-                (self.jobs[0].unit, self.jobs[0].pdu, self.jobs[0].tries)
-            }
-        };
-        let state = &mut self.units[unit];
-        state.counters.requests += 1;
-        state.counters.retries += u64::from(tries > 0);
-        let until_ns = now_ns.saturating_add(self.settings.send_limit_ns);
-        let flight = self.flight.insert(Flight {
-            origin,
-            unit,
-            pdu,
-            phase: Phase::Sending,
-            begun_ns: now_ns,
-            sent_ns: 0,
-            until_ns,
-            damaged: false,
-        });
-        Step::Send { unit: state.number, pdu: flight.pdu.get(), origin }
     }
 }
 

@@ -17,8 +17,9 @@ pub mod order;
 pub mod plan;
 pub mod port;
 mod service;
+pub(crate) mod unit_row;
 pub(crate) mod wiring;
 
 pub use config::Config;
-pub use service::{RunError, run};
+pub use service::{KIND, RunError, run};
 pub use wiring::{check, topics};

@@ -104,7 +104,7 @@ fn input_range(config: &Config, range: &ReadRange) -> ImageRange {
 
 /// The plc service whose image is exchanged, and how its addresses count.
 pub(super) fn plc_of<'a>(stack: &'a Stack, wiring: &Wiring) -> (Option<&'a ServiceEntry>, Addressing) {
-    let plc = wiring.plc.as_deref().and_then(|plc| stack.service(plc)).filter(|plc| plc.kind == "plc");
+    let plc = stack.plc_of(wiring);
     let addressing = plc.and_then(|plc| Addressing::from_name(plc_table::addressing(&plc.config)));
     (plc, addressing.unwrap_or_default())
 }
@@ -136,8 +136,7 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
     let name = &me.name;
     let (plc, addressing) = plc_of(stack, &me.wiring);
     let plan = plan(config, addressing);
-    let mut found: Vec<Finding> =
-        plan.mistakes.iter().map(|m| Finding::error(name, &m.key, &m.message, &m.help)).collect();
+    let mut found: Vec<Finding> = plan.mistakes.iter().map(|m| m.finding(name)).collect();
     if config.reads.is_empty() && config.writes.is_empty() {
         let help = "add [[service.read]] or [[service.write]]; jobs of others are carried out in any case";
         found.push(Finding::warning(name, "", "the service has neither read nor write", help));

@@ -3,6 +3,7 @@
 use super::cache::CacheRange;
 use super::core::{LineSetup, MAX_LINES, Rules};
 use crate::client::line::{MAX_JOBS, Settings, UnitSettings};
+pub use crate::client::plan::Mistake;
 use crate::client::port::SEND_LIMIT_NS;
 use crate::config::Tcp;
 use crate::protocol::pdu::{MAX_READ_BITS, MAX_READ_WORDS};
@@ -125,14 +126,6 @@ impl Default for Config {
             cache: Vec::new(),
         }
     }
-}
-
-/// Something wrong in the service's table.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Mistake {
-    pub key: String,
-    pub message: String,
-    pub help: String,
 }
 
 /// A line of the gateway.

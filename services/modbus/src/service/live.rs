@@ -1,13 +1,13 @@
 //! The service at work: ports, descriptors, loop.
 
 use super::status::{self, LineStatus};
-use super::{LISTENER, RTU_LISTENER, ServiceError, addressing_of};
+use super::{KIND, LISTENER, RTU_LISTENER, ServiceError, addressing_of};
 use crate::buffers::Buffers;
 use crate::config::Config;
 use crate::device::{Device, Shared};
 use crate::line::Line;
+use crate::process::{RunError, Wake, Wakes, listener, run_here};
 use crate::process_image::{BitPlace, Change, NotQueued, ProcessImage, Rail};
-use crate::readable;
 use crate::rights::Rights;
 use crate::session::Framing;
 use crate::tcp::{Backend, Happening, Hub, Options};
@@ -15,27 +15,18 @@ use crate::view::View;
 use crate::watchdog::Watchdog;
 use ipc_types::event::{EventKind, Level};
 use ipc_types::image_write::Builder;
-use ipc_types::inbox::Inbox;
 use ipc_types::payload::{Image, ImageWrite, Inputs, Job, JobResult, SerialChunk};
 use ipc_types::port::{Publisher, SendError, Subscriber};
 use ipc_types::rail::RailError;
 use ipc_types::topic::TopicKind;
+use ipc_types::turns::STATUS_BEATS;
 use ipc_types::wiring::AreaSizes;
 use ipc_types::{Context, clock};
 use serde_json::{Value, json};
 use std::cell::RefCell;
-use std::io;
 use std::net::SocketAddr;
-use std::os::fd::OwnedFd;
 use std::rc::Rc;
-use std::time::Duration;
-use tokio::io::unix::AsyncFd;
-use tokio::net::TcpListener;
-use tokio::time::MissedTickBehavior;
 
-const TICK: Duration = Duration::from_millis(50);
-/// Ticks between two statuses and sweeps: one second.
-const TICKS_PER_STATUS: u32 = 20;
 /// Chunks taken from a line at one wake; more wait for the next turn.
 const CHUNKS_PER_WAKE: usize = 256;
 const JOBS_PER_WAKE: usize = 16;
@@ -134,33 +125,22 @@ struct Live {
 /// Serves until the launcher says stop.
 pub fn run(ctx: Context) -> Result<(), ServiceError> {
     let service = ctx.service.clone();
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_io()
-        .enable_time()
-        .build()
-        .map_err(|source| ServiceError::System { service, what: "starting the runtime", source })?;
-    let local = tokio::task::LocalSet::new();
-    local.block_on(&runtime, serve(ctx))
+    let failed = |source| ServiceError::Run {
+        service,
+        source: RunError::System { kind: KIND, what: "starting the runtime", source },
+    };
+    run_here(serve(ctx), failed)
 }
 
 async fn serve(mut ctx: Context) -> Result<(), ServiceError> {
     let service = ctx.service.clone();
-    let system = |what| {
-        let service = service.clone();
-        move |source: io::Error| ServiceError::System { service, what, source }
-    };
-    let inbox = ctx.inbox().map_err(|source| ServiceError::Rail { service: service.clone(), source })?;
-    let woken = inbox.fd().try_clone_to_owned().map_err(system("duplicating the inbox's descriptor"))?;
-    let woken = readable::watch(woken).map_err(system("watching the inbox"))?;
-    let shutdown =
-        ctx.shutdown_fd().try_clone_to_owned().map_err(system("duplicating the shutdown descriptor"))?;
-    let shutdown = readable::watch(shutdown).map_err(system("watching the shutdown descriptor"))?;
+    let failed = |source| ServiceError::Run { service: service.clone(), source };
+    let mut wakes = Wakes::new(KIND, &mut ctx).map_err(failed)?;
     let mut live = Live::open(&mut ctx)?;
     // The owned inputs go out before the service counts as ready, so that the first scan need not wait.
     live.tick(&mut ctx);
     ctx.ready();
-    live.turns(&mut ctx, inbox, &woken, &shutdown).await;
-    Ok(())
+    live.turns(&mut ctx, &mut wakes).await.map_err(failed)
 }
 
 /// Opens what the transports of a configuration need.
@@ -171,16 +151,8 @@ fn hub(
     device: Device,
     options: Options,
 ) -> Result<(Rc<Hub<Served>>, Option<SocketAddr>), ServiceError> {
-    let service = ctx.service.clone();
-    let system = |what| {
-        let service = service.clone();
-        move |source| ServiceError::System { service, what, source }
-    };
-    let fd = ctx.take_fd(name).map_err(|source| ServiceError::Rail { service: service.clone(), source })?;
-    let listener = std::net::TcpListener::from(fd);
-    listener.set_nonblocking(true).map_err(system("preparing the listener"))?;
-    let listener = TcpListener::from_std(listener).map_err(system("watching the listener"))?;
-    let address = listener.local_addr().ok();
+    let (listener, address) = listener(KIND, ctx, name)
+        .map_err(|source| ServiceError::Run { service: ctx.service.clone(), source })?;
     let hub = Hub::new(Rc::clone(image), device, options);
     tokio::task::spawn_local(hub.clone().accept(listener));
     Ok((hub, address))
@@ -244,28 +216,17 @@ impl Live {
         Ok(live)
     }
 
-    async fn turns(
-        &mut self,
-        ctx: &mut Context,
-        mut inbox: Inbox,
-        woken: &AsyncFd<OwnedFd>,
-        shutdown: &AsyncFd<OwnedFd>,
-    ) {
-        let mut tick = tokio::time::interval(TICK);
-        tick.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    async fn turns(&mut self, ctx: &mut Context, wakes: &mut Wakes) -> Result<(), RunError> {
         let (mut ticks, mut more, mut changed) = (0_u32, false, false);
         loop {
             let mut ticked = false;
             tokio::select! {
                 biased;
-                _ = shutdown.readable() => return,
-                _ = tick.tick() => ticked = true,
-                ready = woken.readable() => {
-                    if let Ok(mut ready) = ready {
-                        ready.clear_ready();
-                    }
-                    inbox.drain();
-                }
+                wake = wakes.next() => match wake? {
+                    Wake::Shutdown => return Ok(()),
+                    Wake::Beat => ticked = true,
+                    Wake::Rail => {}
+                },
                 () = std::future::ready(()), if more => {}
             }
             more = self.serve_lines();
@@ -284,7 +245,7 @@ impl Live {
             if ticks == 0 || std::mem::take(&mut changed) {
                 self.tell_status(ctx);
             }
-            ticks = (ticks + 1) % TICKS_PER_STATUS;
+            ticks = (ticks + 1) % STATUS_BEATS;
         }
     }
 

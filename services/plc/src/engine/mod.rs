@@ -5,7 +5,7 @@
 //! live, in `trace`, and again in the verifier, where the record is its only input.
 //!
 //! A scan: [`Engine::begin`], then what is to be applied, in this order: [`Engine::control`],
-//! [`Engine::input_begin`] .. [`Engine::input_end`], [`Engine::write`]; then [`Engine::finish`], which
+//! [`Engine::input_begin`] .. [`Engine::input_end`], [`Engine::write`], [`Engine::trigger`]; then [`Engine::finish`], which
 //! stamps, copies the inputs, forces, moves routes, runs the due tasks by priority with forces re-applied before
 //! each, forces again, and closes the record. Nothing in it allocates, except when a program faults or starts.
 
@@ -32,7 +32,7 @@ use dinrail_iec::{Artifact, Source as SourceText};
 use ipc_types::image_write;
 use ipc_types::payload::{PlcState, Quality};
 use ipc_types::scan_record::{
-    Command, Fault, Head, MAX_FORCES, MAX_RECORD_BYTES, Outcome, Patch, Source, Start, Writer, flag,
+    Command, Fault, Head, MAX_FORCES, MAX_RECORD_BYTES, Outcome, Patch, Source, Start, Trigger, Writer, flag,
 };
 use ipc_types::wiring::{Area as ImageArea, OnBad};
 use machine::{Machine, RawTrap};
@@ -80,8 +80,10 @@ pub struct ScanOutcome {
     pub outcome: Outcome,
     /// Why the program stopped in this scan.
     pub fault: Option<Box<FaultReport>>,
-    /// Task periods that were skipped because this scan came late.
+    /// Task periods that were skipped because this scan came late, and events that triggered no scan.
     pub skipped: u64,
+    /// The inputs reached the program: a task ran, or without a program the routes.
+    pub used_inputs: bool,
 }
 
 /// Result of a write, as `payload::Image::ack_result`.
@@ -141,6 +143,8 @@ pub struct Engine {
     stamps: Stamps,
     head: Head,
     forces_changed: bool,
+    /// Missed events, when this scan is triggered.
+    triggered: Option<u64>,
     fault: Option<Box<FaultReport>>,
     writer: Writer,
     keyframe: Option<Writer>,
@@ -161,7 +165,7 @@ impl Engine {
             setup.compile_routes(&image).map_err(|(index, source)| EngineError::Route { index, source })?;
         let schedule = program.as_ref().map_or_else(Schedule::default, |p| {
             let map = &p.artifact.map;
-            Schedule::new(&map.tasks, |path| single_bit(map, &image, &setup, path))
+            Schedule::new(&map.tasks, setup.trigger.is_some(), |path| single_bit(map, &image, &setup, path))
         });
         let initial = body.memory().to_vec();
         let searched = (data.offset + data.bytes.min(DATA_SEARCHED)).min(state_end);
@@ -181,6 +185,7 @@ impl Engine {
             stamps: Stamps::default(),
             head: Head::default(),
             forces_changed: false,
+            triggered: None,
             fault: None,
             writer: Writer::new(MAX_RECORD_BYTES),
             keyframe: None,

@@ -8,6 +8,7 @@ impl Engine {
         self.scan += 1;
         self.stamps = stamps;
         self.forces_changed = false;
+        self.triggered = None;
         self.head = Head { state_before: self.state as u8, ..Head::default() };
         self.writer.begin();
     }
@@ -194,6 +195,12 @@ impl Engine {
         write_result::APPLIED
     }
 
+    /// The event came that the tasks without INTERVAL and SINGLE wait for, or is overdue.
+    pub fn trigger(&mut self, trigger: &Trigger) {
+        self.writer.trigger(trigger);
+        self.triggered = Some(trigger.missed);
+    }
+
     /// Runs the scan and closes its record.
     pub fn finish(&mut self) -> ScanOutcome {
         self.finish_with(None)
@@ -208,10 +215,11 @@ impl Engine {
         self.field = field;
         self.apply_forces();
         self.move_routes(true);
-        let mut result = ScanOutcome { outcome: Outcome::Idle, fault: None, skipped: 0 };
+        let mut result = ScanOutcome { outcome: Outcome::Idle, fault: None, skipped: 0, used_inputs: false };
         if self.state == PlcState::Run {
             result.outcome = Outcome::Ok;
             self.run_tasks(killed, &mut result);
+            result.used_inputs = self.program.is_none() || self.head.tasks_ran != 0;
         }
         if self.state == PlcState::Run {
             self.move_routes(false);
@@ -259,9 +267,8 @@ impl Engine {
         let keep = self.kept_on_kill();
         self.before.copy_from_slice(&self.body.memory()[keep]);
         for place in 0..self.schedule.len() {
-            let Some(due) = self.schedule.due(place, self.stamps.plc_time_ns, self.body.memory()) else {
-                continue;
-            };
+            let (now_ns, memory) = (self.stamps.plc_time_ns, self.body.memory());
+            let Some(due) = self.schedule.due(place, now_ns, self.triggered, memory) else { continue };
             if due.skipped > 0 {
                 self.writer.skipped(due.task as u16, due.skipped);
                 result.skipped += due.skipped;

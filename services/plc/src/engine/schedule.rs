@@ -1,4 +1,4 @@
-//! Which tasks are due: a pure function of the scan's stamp, the task table and what ran before.
+//! Which tasks are due: a pure function of the scan's stamp, its trigger, the task table and what ran before.
 
 use dinrail_iec::artifact::Task;
 use ipc_types::scan_record::TaskState;
@@ -9,8 +9,11 @@ pub(crate) struct Slot {
     pub index: usize,
     priority: u32,
     interval_ns: Option<i64>,
+    /// It has neither INTERVAL nor SINGLE, and the stack file names an event that triggers such tasks.
+    on_event: bool,
     /// Offset of the BOOL and its bit, when the task is triggered by an edge.
     single: Option<SingleBit>,
+    /// [`NEVER`] while it waits for an event.
     next_ns: i64,
     last_single: bool,
     pub skipped: u64,
@@ -23,6 +26,9 @@ pub(crate) struct SingleBit {
     pub mask: u8,
 }
 
+/// No PLC time makes a task due.
+const NEVER: i64 = i64::MAX;
+
 /// The task table with its state, highest priority first, then as declared.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Schedule {
@@ -33,12 +39,13 @@ pub(crate) struct Schedule {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Due {
     pub task: usize,
-    /// Periods that were skipped because the scan came late.
+    /// Periods that were skipped because the scan came late, or events that triggered no scan.
     pub skipped: u64,
 }
 
 impl Schedule {
-    pub(crate) fn new(tasks: &[Task], single: impl Fn(&str) -> Option<SingleBit>) -> Self {
+    /// `on_event`: tasks without INTERVAL and SINGLE wait for a trigger; else they run in every scan.
+    pub(crate) fn new(tasks: &[Task], on_event: bool, single: impl Fn(&str) -> Option<SingleBit>) -> Self {
         let mut slots: Vec<Slot> = tasks
             .iter()
             .enumerate()
@@ -46,6 +53,7 @@ impl Schedule {
                 index,
                 priority: task.priority,
                 interval_ns: task.interval_ns.and_then(|ns| i64::try_from(ns).ok()).filter(|ns| *ns > 0),
+                on_event: on_event && task.interval_ns.is_none() && task.single.is_none(),
                 single: task.single.as_deref().and_then(&single),
                 next_ns: i64::MIN,
                 last_single: false,
@@ -60,7 +68,7 @@ impl Schedule {
         self.slots.len()
     }
 
-    /// At a start: periods count from this scan on, which is the first of every periodic task.
+    /// At a start: periods count from this scan on, which is the first of every task that is not triggered by a BOOL.
     pub(crate) fn start(&mut self, plc_time_ns: i64) {
         for slot in &mut self.slots {
             slot.next_ns = plc_time_ns;
@@ -70,7 +78,14 @@ impl Schedule {
     }
 
     /// Whether the slot at this place of the order is due, and takes note of it. Call once a scan for each.
-    pub(crate) fn due(&mut self, place: usize, plc_time_ns: i64, memory: &[u8]) -> Option<Due> {
+    /// `trigger`: the event came, so many were missed before.
+    pub(crate) fn due(
+        &mut self,
+        place: usize,
+        plc_time_ns: i64,
+        trigger: Option<u64>,
+        memory: &[u8],
+    ) -> Option<Due> {
         let slot = self.slots.get_mut(place)?;
         let level =
             slot.single.map(|bit| memory.get(bit.offset as usize).is_some_and(|byte| byte & bit.mask != 0));
@@ -90,6 +105,10 @@ impl Schedule {
                     skipped = late as u64;
                 }
             }
+        } else if slot.on_event {
+            periodic = trigger.is_some() || plc_time_ns >= slot.next_ns;
+            skipped = trigger.unwrap_or(0);
+            slot.next_ns = NEVER;
         } else if slot.single.is_none() {
             periodic = true;
         }
@@ -146,15 +165,50 @@ mod tests {
 
     fn ran(schedule: &mut Schedule, t_ms: i64, memory: &[u8]) -> Vec<(usize, u64)> {
         (0..schedule.len())
-            .filter_map(|i| schedule.due(i, t_ms * 1_000_000, memory))
+            .filter_map(|i| schedule.due(i, t_ms * 1_000_000, None, memory))
             .map(|d| (d.task, d.skipped))
             .collect()
     }
 
     #[test]
+    fn an_event_runs_the_tasks_that_have_no_time_of_their_own() {
+        let tasks = [task(3, Some(10), None), task(0, None, None), task(1, None, Some("go"))];
+        let mut schedule = Schedule::new(&tasks, true, |_| Some(SingleBit { offset: 0, mask: 1 }));
+        let mut state = Vec::new();
+        schedule.start(0);
+        for (t_ms, trigger, expected) in [
+            (0, None, vec![(1, 0), (0, 0)]), // the start
+            (4, None, vec![]),
+            (5, Some(0), vec![(1, 0)]),
+            (6, None, vec![]),
+            (10, Some(3), vec![(1, 3), (0, 0)]),
+            (20, None, vec![(0, 0)]),
+            (21, Some(0), vec![(1, 0)]),
+        ] {
+            // Whoever continues from a keyframe comes to the same.
+            let mut again = Schedule::new(&tasks, true, |_| Some(SingleBit { offset: 0, mask: 1 }));
+            for task in &state {
+                again.restore(task);
+            }
+            let now = |schedule: &mut Schedule| -> Vec<(usize, u64)> {
+                (0..schedule.len())
+                    .filter_map(|i| schedule.due(i, t_ms * 1_000_000, trigger, &[0]))
+                    .map(|d| (d.task, d.skipped))
+                    .collect()
+            };
+            if !state.is_empty() {
+                assert_eq!(now(&mut again), expected, "again at {t_ms} ms");
+            }
+            assert_eq!(now(&mut schedule), expected, "at {t_ms} ms");
+            state = schedule.states().collect();
+        }
+        assert_eq!((schedule.skipped_total(), schedule.next_ns()), (3, Some(30_000_000)));
+    }
+
+    #[test]
     fn priority_orders_and_late_scans_skip_periods() {
         let tasks = [task(5, Some(10), None), task(1, Some(25), None), task(1, None, None)];
-        let mut schedule = Schedule::new(&tasks, |_| None);
+        let mut schedule = Schedule::new(&tasks, false, |_| None);
         schedule.start(100_000_000);
         for (t_ms, expected) in [
             (100, vec![(1, 0), (2, 0), (0, 0)]),
@@ -174,7 +228,7 @@ mod tests {
     #[test]
     fn single_runs_on_the_rising_edge_and_the_period_only_while_it_is_low() {
         let mut schedule =
-            Schedule::new(&[task(0, Some(10), Some("go"))], |_| Some(SingleBit { offset: 0, mask: 2 }));
+            Schedule::new(&[task(0, Some(10), Some("go"))], true, |_| Some(SingleBit { offset: 0, mask: 2 }));
         schedule.start(0);
         for (t_ms, byte, runs) in
             [(0, 0, true), (5, 2, true), (10, 2, false), (15, 0, false), (20, 0, true), (21, 2, true)]

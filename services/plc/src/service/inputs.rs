@@ -17,7 +17,9 @@ pub(super) struct InputSource {
     /// Bytes of each of its ranges.
     lengths: Vec<u32>,
     tail: Vec<u8>,
-    source: Source,
+    pub source: Source,
+    /// Of its newest message.
+    pub samples: u64,
     fresh: bool,
     /// CLOCK_MONOTONIC of its last sample; 0 = none yet.
     last_ns: u64,
@@ -48,6 +50,7 @@ impl InputSource {
                 first_range: first as u16,
                 tail: vec![0; tail],
                 source: Source { writer: service.index, ..Source::default() },
+                samples: 0,
                 fresh: false,
                 last_ns: 0,
                 died_ns: 0,
@@ -64,7 +67,8 @@ impl InputSource {
 
     /// Takes the newest sample, if there is a new one.
     pub(super) fn poll(&mut self) -> bool {
-        let Self { subscriber, tail, source, fresh, last_ns, malformed, lengths, data_t_ns, .. } = self;
+        let Self { subscriber, tail, source, samples, fresh, last_ns, malformed, lengths, data_t_ns, .. } =
+            self;
         subscriber.newest(|header, bytes| {
             if header.ranges as usize != lengths.len() || bytes.len() != tail.len() {
                 *malformed += 1;
@@ -75,6 +79,7 @@ impl InputSource {
             *source = Source { writer: stamp.writer, generation: stamp.generation, seq: stamp.seq };
             *last_ns = stamp.t_ns;
             *data_t_ns = header.data_t_ns;
+            *samples = header.samples;
             *fresh = true;
         });
         self.fresh

@@ -9,8 +9,9 @@ use super::inputs::InputSource;
 use super::jobs::{self, Asker, Order, Request};
 use super::load::Loading;
 use super::status::{Counters, ScanTimes, status};
+use super::watch::Watch;
 use super::{RETAIN_FD, RunError, restart_of};
-use crate::config::{Config, DEFAULT_CYCLE, Trigger};
+use crate::config::{Config, DEFAULT_CYCLE, Trigger, TriggerWord};
 use crate::engine::{Engine, FaultReport, Runtime, Stamps, write_result};
 use crate::retain::{Committer, DiskCopy, MEMORY_BYTES, Mapping, newest, read_file};
 use ipc_types::event::{EventBody, EventKind, Level};
@@ -52,6 +53,8 @@ const UTC_STEP_NS: i64 = 50_000;
 pub(super) struct Live {
     pub engine: Engine,
     pub inputs: Vec<InputSource>,
+    /// The event that scans wait for, where the trigger is one.
+    pub watch: Option<Watch>,
     pub counters: Counters,
     pub shown_times: ScanTimes,
     times: ScanTimes,
@@ -107,8 +110,13 @@ impl Live {
         let rail = |source: RailError| RunError::Rail { service: service.clone(), source };
         let of = |kind: TopicKind| kind.of(&service);
         let now_ns = clock::mono_ns();
+        let inputs = InputSource::open_all(ctx).map_err(rail)?;
         let mut live = Self {
-            inputs: InputSource::open_all(ctx).map_err(rail)?,
+            watch: config.trigger.event().and_then(|event| {
+                let at = inputs.iter().position(|source| source.name == event.service)?;
+                Some(Watch::new(at, config.max_interval.ns()))
+            }),
+            inputs,
             inbox: ctx.inbox().map_err(rail)?,
             image_port: ctx.publisher(&of(TopicKind::Image)).map_err(rail)?,
             scan_port: ctx.publisher(&of(TopicKind::Scan)).map_err(rail)?,
@@ -286,8 +294,12 @@ impl Live {
         if all || over {
             self.waiting = false;
             // The PLC's time does not run while it waits.
-            let waited = clock::mono_ns() as i64 - self.started_ns as i64;
-            self.base_ns += waited;
+            let now_ns = clock::mono_ns();
+            self.base_ns += now_ns as i64 - self.started_ns as i64;
+            if let Some(watch) = &mut self.watch {
+                let source = &self.inputs[watch.at];
+                watch.begin(now_ns, &source.source, source.samples);
+            }
         }
         !self.waiting
     }
@@ -301,7 +313,14 @@ impl Live {
         }
         self.read_events();
         self.take_jobs(ctx);
-        news && self.config.trigger == Trigger::Inputs
+        match (&self.config.trigger, &mut self.watch) {
+            (Trigger::Word(word), _) => news && *word == TriggerWord::Inputs,
+            (Trigger::Event(_), Some(watch)) => {
+                let source = &self.inputs[watch.at];
+                watch.look(&source.source, source.samples) > 0
+            }
+            (Trigger::Event(_), None) => false,
+        }
     }
 
     fn read_events(&mut self) {
@@ -338,10 +357,12 @@ impl Live {
         let running = self.engine.state() == PlcState::Run;
         let task =
             self.engine.next_task_ns().filter(|_| running).map(|plc| (plc + self.base_ns).max(0) as u64);
-        match (self.config.trigger, task) {
+        // An event that fails to come is due at its own time, whatever else makes scans.
+        let latest = self.watch.as_ref().map_or(latest, |watch| watch.due_ns().clamp(now_ns, latest));
+        match (&self.config.trigger, task) {
             (_, Some(task)) => task.clamp(now_ns.min(latest), latest),
-            (Trigger::Inputs, None) => latest,
-            (Trigger::Cycle, None) => {
+            (Trigger::Word(TriggerWord::Inputs) | Trigger::Event(_), None) => latest,
+            (Trigger::Word(TriggerWord::Cycle), None) => {
                 // On the grid of the last stamp, so that the clock has no drift.
                 let cycle = self.cycle_ns();
                 let mut next = self.last_stamp_ns.max(0) as u64 + cycle;
@@ -372,12 +393,18 @@ impl Live {
             commands += 1;
         }
         let timeout_ns = self.config.input_timeout.ns();
+        // Before the first look: what a service sent earlier is in this scan.
+        let inputs_t_ns = clock::mono_ns();
         for source in &mut self.inputs {
             source.poll();
             source.apply(&mut self.engine, now_ns, timeout_ns, true);
         }
         self.take_writes(now_ns);
+        self.take_event(now_ns);
         let outcome = self.engine.finish();
+        if outcome.used_inputs {
+            self.header.inputs_t_ns = inputs_t_ns;
+        }
         if let Some((mapping, committer)) = &mut self.retain {
             let plc_time_ns = self.last_stamp_ns - self.base_ns;
             committer.commit(mapping.bytes_mut(), self.retain_layout, plc_time_ns, self.engine.retain());
@@ -410,7 +437,7 @@ impl Live {
     /// A scan on time carries the time it was due: the clock's jitter is not the program's.
     fn stamps(&mut self, now_ns: u64, due_ns: u64) -> Stamps {
         let late_ns = now_ns.saturating_sub(due_ns);
-        let on_time = self.config.trigger == Trigger::Cycle && now_ns >= due_ns && late_ns < self.cycle_ns();
+        let on_time = self.config.trigger == Trigger::CYCLE && now_ns >= due_ns && late_ns < self.cycle_ns();
         let stamp = if on_time { due_ns } else { now_ns } as i64;
         let stamp = stamp.max(self.last_stamp_ns);
         self.last_stamp_ns = stamp;
@@ -419,6 +446,18 @@ impl Live {
         }
         let t_ns = now_ns & !(STAMP_NS - 1);
         Stamps { t_ns, plc_time_ns: stamp - self.base_ns, utc_ns: t_ns as i64 + self.utc_offset_ns }
+    }
+
+    /// Whether the tasks that wait for an event are due, for the engine and its record.
+    fn take_event(&mut self, now_ns: u64) {
+        let Some(watch) = &mut self.watch else { return };
+        if self.orders.iter().any(|(_, order)| matches!(order, Order::Start(_))) {
+            watch.started(now_ns);
+        }
+        let source = &self.inputs[watch.at];
+        if let Some(trigger) = watch.take(now_ns, &source.source, source.samples) {
+            self.engine.trigger(&trigger);
+        }
     }
 
     fn take_writes(&mut self, now_ns: u64) {

@@ -44,6 +44,15 @@ pub(super) fn status(live: &Live, now_ns: u64) -> Value {
             })
         })
         .collect();
+    let trigger = live.watch.as_ref().map(|watch| {
+        let counters = watch.counters;
+        json!({
+            "service": live.inputs[watch.at].name,
+            "events": counters.events,
+            "missed": counters.missed,
+            "overdue": counters.overdue,
+        })
+    });
     let forces: Vec<&str> = engine.forces().map(|(path, _)| path).take(64).collect();
     let counters = live.counters;
     json!({
@@ -58,6 +67,7 @@ pub(super) fn status(live: &Live, now_ns: u64) -> Value {
             "late_max": times.late_max_ns as f64 / 1e3,
         },
         "periods_skipped": engine.skipped_total(),
+        "trigger": trigger,
         "warnings": engine.warnings(),
         "forces": forces,
         "inputs": inputs,

@@ -198,3 +198,156 @@ mod any_job {
         }
     }
 }
+
+mod event_trigger {
+    use super::*;
+    use ipc_types::stack::Severity;
+    use ipc_types::wiring::ServiceEvent;
+
+    /// Kind, table and wiring.
+    type Io<'a> = (&'a str, serde_json::Value, Wiring);
+
+    /// What is said about a trigger by such an 'io'.
+    fn said(config: serde_json::Value, io: Io<'_>, program: &str) -> Vec<(bool, String)> {
+        static NUMBER: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(0);
+        let n = NUMBER.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+        let dir = std::env::temp_dir().join(format!("dinrail-plc-event-{}-{n}", std::process::id()));
+        std::fs::create_dir_all(&dir).unwrap();
+        std::fs::write(dir.join("main.st"), program).unwrap();
+        let mut stack = stack(&dir, Vec::new());
+        let (kind, table, wiring) = io;
+        stack.services[0] =
+            ServiceEntry { kind: kind.into(), config: table, wiring, ..stack.services[0].clone() };
+        let config: Config = serde_json::from_value(config).unwrap();
+        let findings = check(&config, &stack, &stack.services[1]);
+        std::fs::remove_dir_all(&dir).unwrap();
+        findings
+            .iter()
+            .map(|f| {
+                (
+                    f.severity == Severity::Error,
+                    format!("{}.{}: {} | {}", f.service, f.key, f.message, f.help),
+                )
+            })
+            .collect()
+    }
+
+    fn wiring(plc: Option<&str>, events: &[ServiceEvent]) -> Wiring {
+        Wiring { plc: plc.map(str::to_owned), events: events.to_vec(), ..Wiring::default() }
+    }
+
+    const PLAIN: &str = "PROGRAM main VAR n : UINT; END_VAR n := n + 1; END_PROGRAM";
+    const TIMED: &str = "PROGRAM p VAR n : INT; END_VAR n := 1; END_PROGRAM CONFIGURATION c RESOURCE r ON PLC TASK t(INTERVAL := T#10ms, PRIORITY := 0); PROGRAM i WITH t : p; END_RESOURCE END_CONFIGURATION";
+
+    #[test]
+    fn what_can_trigger_is_said() {
+        let sync = [ServiceEvent::Sync];
+        let event = |service: &str| json!({ "program": ["main.st"], "trigger": { "service": service, "event": "sync" } });
+        let master = |period: &str| json!({ "sync_period": period });
+        let with = |key: &str, value: &str| {
+            let mut config = event("io");
+            config[key] = json!(value);
+            config
+        };
+        let table: Vec<(serde_json::Value, Io<'_>, &str, &str)> = vec![
+            (event("io"), ("canopen-master", master("10ms"), wiring(Some("plc"), &sync)), PLAIN, ""),
+            (
+                event("oi"),
+                ("canopen-master", master("10ms"), wiring(Some("plc"), &sync)),
+                PLAIN,
+                "plc.trigger.service: there is no service 'oi' | write service = \"io\"",
+            ),
+            (
+                event("io"),
+                ("can", json!({}), wiring(None, &[])),
+                PLAIN,
+                "plc.trigger.service: 'io' is a can service, which has no event \"sync\" | only a canopen-master with sync_period and synchronous inputs has it; take trigger = \"inputs\" for others",
+            ),
+            (
+                event("io"),
+                ("can-io", json!({}), wiring(Some("plc"), &[])),
+                PLAIN,
+                "plc.trigger.service: 'io' is a can-io service, which has no event \"sync\" | only",
+            ),
+            (
+                event("io"),
+                ("canopen-master", master("10ms"), wiring(Some("plc2"), &sync)),
+                PLAIN,
+                "plc.trigger.service: the inputs of 'io' go to 'plc2', not to 'plc' | move",
+            ),
+            (
+                event("io"),
+                ("canopen-master", json!({}), wiring(Some("plc"), &[])),
+                PLAIN,
+                "plc.trigger.service: 'io' sends no SYNC: it has no sync_period | set sync_period = \"10ms\" in service 'io'",
+            ),
+            (
+                event("io"),
+                ("canopen-master", master("10ms"), wiring(Some("plc"), &[])),
+                PLAIN,
+                "plc.trigger.service: 'io' has no synchronous inputs, so that it publishes no sample at a SYNC | map",
+            ),
+            (
+                event("io"),
+                ("canopen-master", master("10ms"), wiring(Some("plc"), &sync)),
+                TIMED,
+                "plc.trigger: trigger = { service = \"io\", event = \"sync\" } triggers nothing: every TASK of the program has INTERVAL or SINGLE | leave",
+            ),
+            (
+                with("cycle", "10ms"),
+                ("canopen-master", master("10ms"), wiring(Some("plc"), &sync)),
+                PLAIN,
+                "plc.cycle: cycle and trigger = { service = \"io\", event = \"sync\" } exclude each other | leave cycle out",
+            ),
+        ];
+        for (config, io, program, expected) in table {
+            let found = said(config.clone(), io, program);
+            match expected {
+                "" => assert_eq!(found, [], "{config}"),
+                _ => assert!(
+                    found.iter().any(|(error, text)| *error && text.starts_with(expected)),
+                    "{config}: expected {expected:?} in {found:#?}"
+                ),
+            }
+        }
+        for (config, expected) in [
+            (
+                with("max_interval", "10ms"),
+                "plc.max_interval: max_interval = 10ms is not longer than the sync_period",
+            ),
+            (
+                with("min_interval", "11ms"),
+                "plc.min_interval: min_interval = 11ms is longer than the sync_period",
+            ),
+        ] {
+            let io = ("canopen-master", master("10ms"), wiring(Some("plc"), &sync));
+            let found = said(config, io, PLAIN);
+            assert!(matches!(&found[..], [(false, text)] if text.starts_with(expected)), "{found:#?}");
+        }
+    }
+
+    #[test]
+    fn other_forms_are_refused_when_the_table_is_read() {
+        for (bad, expected) in [
+            (
+                json!({ "trigger": "sync" }),
+                "expected \"cycle\", \"inputs\" or { service = \"io\", event = \"sync\" }",
+            ),
+            (
+                json!({ "trigger": { "service": "io", "event": "snyc" } }),
+                "unknown variant `snyc`, expected `sync`",
+            ),
+            (json!({ "trigger": { "service": "io" } }), "missing field `event`"),
+            (json!({ "trigger": { "service": "io", "event": "sync", "every": 2 } }), "unknown field `every`"),
+            (json!({ "trigger": 5 }), "expected \"cycle\", \"inputs\" or"),
+        ] {
+            let error = serde_json::from_value::<Config>(bad.clone()).unwrap_err().to_string();
+            assert!(error.contains(expected), "{bad}: {error}");
+        }
+        let event: Config =
+            serde_json::from_value(json!({ "trigger": { "service": "io", "event": "sync" } })).unwrap();
+        let again: Config = serde_json::from_value(serde_json::to_value(&event).unwrap()).unwrap();
+        assert_eq!(event, again);
+        assert_ne!(event, Config::default());
+    }
+}

@@ -3,7 +3,7 @@ use crate::program::compile_sources;
 use crate::setup::InputRange;
 use dinrail_iec::Source as SourceText;
 use ipc_types::image_write::{Builder, Op};
-use ipc_types::scan_record::{Command, Source, Start};
+use ipc_types::scan_record::{Command, Source, Start, Trigger, tag};
 use ipc_types::wiring::{Area, OnBad};
 use proptest::prelude::*;
 use serde_json::json;
@@ -56,6 +56,8 @@ enum Step {
     Start(Start),
     Stop,
     Set(f32),
+    /// The event came, so many were missed; or it is overdue.
+    Event(u64, bool),
 }
 
 fn step() -> impl Strategy<Value = Step> {
@@ -69,12 +71,16 @@ fn step() -> impl Strategy<Value = Step> {
         1 => prop_oneof![Just(Start::Cold), Just(Start::Warm), Just(Start::Hot)].prop_map(Step::Start),
         1 => Just(Step::Stop),
         1 => any::<f32>().prop_map(Step::Set),
+        3 => (0u64..4, any::<bool>()).prop_map(|(missed, overdue)| Step::Event(missed, overdue)),
     ]
 }
 
 /// Records a run in virtual time: keyframe 0, then a record a step, keyframes every `every` scans.
 fn record(steps: &[(Step, i64)], every: usize) -> Recording {
-    let setup = setup();
+    record_as(setup(), steps, every)
+}
+
+fn record_as(setup: Setup, steps: &[(Step, i64)], every: usize) -> Recording {
     let program = program(PROGRAM, &setup);
     let mut engine = Engine::new(&Runtime::new().unwrap(), Some(program), Arc::new(setup)).unwrap();
     let mut out: Recording = vec![(1, engine.take_keyframe(Reason::EngineStart).to_vec())];
@@ -134,11 +140,25 @@ fn apply(engine: &mut Engine, source: &Source, step: &Step) {
             let patch = patch(engine, "main.sum", value);
             engine.control(source, &Command::Set { patch, path: "main.sum" });
         }
+        Step::Event(missed, overdue) => {
+            let count = source.seq;
+            engine.trigger(&Trigger { source: *source, count, missed: *missed, overdue: *overdue });
+        }
     }
 }
 
+/// The implicit task waits for an event.
+fn triggered() -> Setup {
+    let event =
+        crate::config::EventTrigger { service: "io".into(), event: ipc_types::wiring::ServiceEvent::Sync };
+    Setup { cycle_ns: None, trigger: Some(event), ..setup() }
+}
+
 fn verify_with(recording: &[(u32, Vec<u8>)], compare: Option<&str>) -> Report {
-    let setup = setup();
+    verify_as(setup(), recording, compare)
+}
+
+fn verify_as(setup: Setup, recording: &[(u32, Vec<u8>)], compare: Option<&str>) -> Report {
     let known = program(PROGRAM, &setup);
     let provider: Provider<'_> =
         Box::new(move |hash, _| (hash == known.artifact.hash()).then(|| known.clone()));
@@ -188,7 +208,60 @@ proptest! {
         prop_assert_eq!(&report.first_difference, &None);
         prop_assert_eq!(report.scans_verified, steps.len() as u64);
         prop_assert_eq!(report.exit_code(), 0);
+        let report = verify_as(triggered(), &record_as(triggered(), &steps, 37), None);
+        prop_assert_eq!(&report.first_difference, &None);
+        prop_assert_eq!((report.scans_verified, report.exit_code()), (steps.len() as u64, 0));
     }
+}
+
+#[test]
+fn a_task_runs_in_the_scans_whose_record_says_that_the_event_came() {
+    let steps: Vec<(Step, i64)> = [
+        Step::Nothing,
+        Step::Event(0, false),
+        Step::Input(true, 5),
+        Step::Event(2, false),
+        Step::Stop,
+        Step::Event(0, false),
+        Step::Start(Start::Hot),
+        Step::Event(0, true),
+        Step::Write(9),
+    ]
+    .into_iter()
+    .map(|step| (step, 0))
+    .collect();
+    let recording = record_as(triggered(), &steps, 3);
+    let report = verify_as(triggered(), &recording, None);
+    assert_eq!((report.scans_verified, report.exit_code(), &report.first_difference), (9, 0, &None));
+    let ran: Vec<bool> = recording
+        .iter()
+        .filter_map(|(_, bytes)| Content::parse(bytes).ok().filter(|c| c.head.kind == Kind::Scan))
+        .map(|c| c.head.tasks_ran != 0)
+        .collect();
+    // The first and the hot start are scans of the task as well.
+    assert_eq!(ran, [true, true, false, true, false, false, true, true, false]);
+    let skipped: Vec<u64> = recording
+        .iter()
+        .filter_map(|(_, bytes)| Content::parse(bytes).ok())
+        .flat_map(|c| {
+            c.sections()
+                .filter_map(|s| if let Section::Skipped { periods, .. } = s { Some(periods) } else { None })
+                .collect::<Vec<_>>()
+        })
+        .collect();
+    assert_eq!(skipped, [2]);
+    // Without what the record says of the event the task does not run.
+    let mut without = recording.clone();
+    let bytes = &mut without[2].1;
+    let content = Content::parse(bytes).unwrap();
+    assert!(
+        content.sections().any(|s| matches!(s, Section::Trigger(Trigger { missed: 0, overdue: false, .. })))
+    );
+    let at = ipc_types::scan_record::HEAD_BYTES;
+    assert_eq!(bytes[at], tag::TRIGGER);
+    bytes[at] = 99;
+    let report = verify_as(triggered(), &without, None);
+    assert_eq!((report.exit_code(), report.first_difference.map(|d| d.scan)), (1, Some(2)));
 }
 
 /// Position of a section's body in the record of a scan.

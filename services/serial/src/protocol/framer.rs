@@ -302,23 +302,36 @@ impl Framer {
         }
     }
 
-    /// More than any frame, and no silence yet: what is whole goes out; a beginning at the end stays.
+    /// More than any frame, and no silence yet: what is whole goes out; what can still become a frame stays.
     fn overfull(&mut self, now_ns: u64, out: &mut Out<'_>) {
         let (mut good, mut from) = (false, 0);
-        rtu::cut(&self.buffer[..], &self.marks[..self.mark_count], |piece| {
+        let marks = &self.marks[..self.mark_count];
+        rtu::cut(&self.buffer[..], marks, |piece| {
             (good, from) = (piece.good, piece.from);
         });
-        if good || CHUNK_BYTES - from >= MAX_RTU {
+        // A frame that is not whole yet began later than this: behind a good one, or behind a silence.
+        let oldest = CHUNK_BYTES - MAX_RTU;
+        let begins = std::iter::once(from).chain(marks.iter().map(|m| usize::from(*m)));
+        let kept = begins.filter(|at| !good && *at > oldest && *at >= from && *at < CHUNK_BYTES).min();
+        let Some(kept) = kept else {
             self.rtu_emit(CHUNK_BYTES, now_ns, out);
             self.clear();
             self.skipping = !good;
-        } else {
-            self.rtu_emit(from, now_ns, out);
-            self.buffer.copy_within(from.., 0);
-            self.len -= from;
-            self.mark_count = 0;
-            self.first_ns = self.byte_ns;
+            return;
+        };
+        self.rtu_emit(kept, now_ns, out);
+        self.buffer.copy_within(kept.., 0);
+        self.len -= kept;
+        let mut count = 0;
+        for i in 0..self.mark_count {
+            let mark = usize::from(self.marks[i]);
+            if mark > kept {
+                self.marks[count] = (mark - kept) as u16;
+                count += 1;
+            }
         }
+        self.mark_count = count;
+        self.first_ns = self.byte_ns;
     }
 
     /// A silence that ends a frame has passed.

@@ -186,6 +186,31 @@ fn a_backlog_longer_than_the_buffer_keeps_its_frames() {
 }
 
 #[test]
+fn a_frame_behind_a_buffer_full_of_beginnings_is_found() {
+    // Four pieces of noise, each of which may be the beginning of a longer frame, fill the buffer but for a part of
+    // the good frame behind them.
+    let answer = frame(&[&[1u8, 3, 200][..], &[5; 200]].concat());
+    let char_ns = Timing::new(9600, 11).char_ns;
+    for last in [210, 230, 255] {
+        let mut line = Line::rtu(20 * MS);
+        let mut t = 1000 * MS;
+        for len in [255, 255, 255, last] {
+            let mut noise = vec![0x77; len];
+            noise[1] = 99;
+            t += len as u64 * char_ns;
+            line.push(t, &noise);
+            t += 10 * MS;
+            line.turn(t);
+        }
+        assert!(line.seen.is_empty(), "all of it is kept");
+        t += answer.len() as u64 * char_ns;
+        line.push(t, &answer);
+        line.turn(t + 100 * MS);
+        assert_eq!(line.good(), std::slice::from_ref(&answer), "{last}");
+    }
+}
+
+#[test]
 fn line_errors_mark_their_frame() {
     let mut line = Line::rtu(0);
     let request = frame(&[1, 6, 0, 1, 0, 2]);
@@ -300,8 +325,6 @@ fn any_frame() -> impl Strategy<Value = Vec<u8>> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(200))]
-
     #[test]
     fn never_panics_and_loses_nothing_uncounted(
         mode in any_mode(),

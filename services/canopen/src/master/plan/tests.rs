@@ -1,4 +1,5 @@
 use super::*;
+use crate::master::boot::Write;
 use crate::master::testing::device;
 use serde_json::json;
 

@@ -46,7 +46,7 @@ impl Eds {
         self.check_values(&mut diags);
         self.check_pdos(&mut diags);
         diags.sort_by_key(|diag| (diag.line, diag.severity));
-        diags
+        super::thin_out(diags)
     }
 
     fn check_objects(&self, diags: &mut Vec<Diag>) {
@@ -138,15 +138,26 @@ impl Eds {
             }
             let count = object.subs.get(&0).and_then(|entry| entry.default.as_ref());
             let count = count.map_or(0, |value| unsigned_of(&value.bytes)).min(64) as u8;
-            let mut bits = 0;
+            let (mut bits, mut empty) = (0, 0);
             for sub in 1..=count {
                 let Some(entry) = object.subs.get(&sub) else { continue };
                 let mapped = entry.default.as_ref().map_or(0, |value| unsigned_of(&value.bytes)) as u32;
+                if mapped == 0 {
+                    empty += 1;
+                    continue;
+                }
                 bits += mapped & 0xFF;
                 if let Some(text) = self.mapping_fault(mapped, receive) {
                     let line = self.line_of(index, sub, "DefaultValue", entry.line);
                     diags.push(Diag::error(line, &section_name(self, index, sub), "DefaultValue", text));
                 }
+            }
+            if empty > 0 {
+                let line = self.line_of(index, 0, "DefaultValue", object.line);
+                let text = format!(
+                    "says {count} objects are mapped, of which {empty} are 0: nobody can use the PDO"
+                );
+                diags.push(Diag::error(line, &section_name(self, index, 0), "DefaultValue", text));
             }
             if bits > 64 {
                 let text = format!("the mapped objects have {bits} bits, a PDO has 64");

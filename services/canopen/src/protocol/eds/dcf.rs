@@ -1,4 +1,4 @@
-//! Writing a DCF (CiA 306-1 V1.3, 5): the file as it was, with the node's identity and its values.
+//! Writing a DCF (CiA 306-1 V1.4, 7): the file as it was, with the node's identity and its values.
 
 use super::value::{fault, format};
 use super::{Commissioning, Eds};
@@ -102,8 +102,7 @@ impl Eds {
         if object.is_some_and(|object| object.compact > 0 && sub != 0) {
             let section = ini.get_or_make(&format!("{main}Value"), Some(&main));
             section.set(&sub.to_string(), text);
-            let count =
-                section.keys.iter().filter(|key| !key.key.eq_ignore_ascii_case("NrOfEntries")).count();
+            let count = section.keys.iter().filter(|key| !key.is("NrOfEntries")).count();
             section.set("NrOfEntries", &count.to_string());
             return;
         }

@@ -1,4 +1,4 @@
-//! The shape of an EDS or DCF: sections of `key=value` lines (CiA 306-1 V1.3, 4.1), read so that what real files
+//! The shape of an EDS or DCF: sections of `key=value` lines (CiA 306-1 V1.4, 6.2), read so that what real files
 //! do wrong costs a warning and not the file.
 
 use super::{Diag, EdsError, limit};
@@ -10,6 +10,15 @@ pub struct Key {
     pub key: String,
     pub value: String,
     pub line: u32,
+}
+
+impl Key {
+    /// Is this the key `name`, whatever its case and blanks in it (`Supported Objects`)?
+    pub fn is(&self, name: &str) -> bool {
+        self.key.eq_ignore_ascii_case(name)
+            || (self.key.contains(char::is_whitespace)
+                && self.key.split_whitespace().collect::<String>().eq_ignore_ascii_case(name))
+    }
 }
 
 /// A section as it stands in the file.
@@ -24,7 +33,7 @@ pub struct Section {
 impl Section {
     /// The value of a key, whatever its case.
     pub fn get(&self, key: &str) -> Option<&Key> {
-        self.keys.iter().find(|found| found.key.eq_ignore_ascii_case(key))
+        self.keys.iter().find(|found| found.is(key))
     }
     /// The text of a key, `""` without one.
     pub fn text(&self, key: &str) -> &str {
@@ -32,7 +41,7 @@ impl Section {
     }
     /// Sets a key, behind the others if it is new.
     pub fn set(&mut self, key: &str, value: &str) {
-        match self.keys.iter_mut().find(|found| found.key.eq_ignore_ascii_case(key)) {
+        match self.keys.iter_mut().find(|found| found.is(key)) {
             Some(found) => found.value = value.to_owned(),
             None => self.keys.push(Key { key: key.to_owned(), value: value.to_owned(), line: 0 }),
         }
@@ -85,7 +94,9 @@ impl Ini {
         let mut ini = Self::default();
         let mut current: Option<usize> = None;
         let mut total = 0usize;
-        for (at, line) in text.lines().enumerate() {
+        // Line ends of old Macs: no line would end otherwise.
+        let mac = text.contains('\r') && !text.contains('\n');
+        for (at, line) in text.split(if mac { '\r' } else { '\n' }).enumerate() {
             let number = u32::try_from(at + 1).unwrap_or(u32::MAX);
             if line.len() > limit::LINE {
                 return Err(EdsError::LineTooLong { line: number });
@@ -94,7 +105,8 @@ impl Ini {
             if total > limit::LINES {
                 return Err(EdsError::TooManyLines);
             }
-            let line = line.trim_matches(|c: char| c.is_whitespace() || c == '\0' || c == '\u{FEFF}');
+            let line =
+                line.trim_matches(|c: char| c.is_whitespace() || matches!(c, '\0' | '\u{1A}' | '\u{FEFF}'));
             if line.is_empty() || line.starts_with(';') || line.starts_with('#') {
                 continue;
             }

@@ -1,4 +1,4 @@
-//! Electronic data sheets (EDS) and device configuration files (DCF): CiA 306-1 V1.3; concise DCF: CiA 302-3.
+//! Electronic data sheets (EDS) and device configuration files (DCF): CiA 306-1; concise DCF: CiA 302-3.
 //!
 //! The reader takes what real files contain: whatever is wrong but harmless becomes a warning with its line, and
 //! only what makes the file useless is an error. It must never panic, whatever the file, and never read another
@@ -12,7 +12,10 @@ mod check;
 pub mod concise;
 mod dcf;
 mod ini;
+mod made;
 mod parse;
+#[cfg(test)]
+mod rough_tests;
 #[cfg(test)]
 mod tests;
 pub mod value;
@@ -24,7 +27,7 @@ pub use value::Value;
 
 use super::data_type::{DataType, Number, unsigned as unsigned_of};
 use super::od::{Access, ObjectCode};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fmt;
 
 /// Limits of a file.
@@ -89,6 +92,35 @@ impl Diag {
     }
 }
 
+/// Findings of one kind that are kept one by one; the others are told with the first of them.
+const ALIKE: usize = 5;
+
+/// A tool writes its peculiarity hundreds of times: of findings with one text only [`ALIKE`] are kept, and one more
+/// that says how many there are and up to which line.
+fn thin_out(diags: Vec<Diag>) -> Vec<Diag> {
+    let mut kinds: HashMap<(String, String), (usize, u32)> = HashMap::new();
+    for diag in &diags {
+        let kind = kinds.entry((diag.key.clone(), diag.text.clone())).or_default();
+        *kind = (kind.0 + 1, kind.1.max(diag.line));
+    }
+    let mut seen: HashMap<(String, String), usize> = HashMap::new();
+    diags
+        .into_iter()
+        .filter_map(|mut diag| {
+            let kind = (diag.key.clone(), diag.text.clone());
+            let (count, last) = kinds.get(&kind).copied().unwrap_or_default();
+            let at = seen.entry(kind).or_default();
+            *at += 1;
+            if count <= ALIKE + 1 || *at <= ALIKE {
+                return Some(diag);
+            }
+            let more = count - *at;
+            diag.text = format!("{} (so {more} times more, up to line {last})", diag.text);
+            (*at == ALIKE + 1).then_some(diag)
+        })
+        .collect()
+}
+
 impl fmt::Display for Diag {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if self.line != 0 {
@@ -104,7 +136,7 @@ impl fmt::Display for Diag {
     }
 }
 
-/// Section `[DeviceInfo]` (CiA 306-1 V1.3, 4.4).
+/// Section `[DeviceInfo]` (CiA 306-1 V1.4, 6.5).
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct DeviceInfo {
     pub vendor_name: String,
@@ -127,7 +159,7 @@ pub struct DeviceInfo {
     pub compact_pdo: u8,
 }
 
-/// Section `[DeviceComissioning]` of a DCF, misspelt by the standard (CiA 306-1 V1.3, 5.2).
+/// Section `[DeviceComissioning]` of a DCF, misspelt by the standard (CiA 306-1 V1.4, 7.3.5).
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Commissioning {
     /// 1-127; 0: not given.
@@ -141,7 +173,7 @@ pub struct Commissioning {
     pub lss_serial_number: u32,
 }
 
-/// Which list names an object (CiA 306-1 V1.3, 4.6.2).
+/// Which list names an object (CiA 306-1 V1.4, 6.6.3.1).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum List {
     Mandatory,

@@ -1,6 +1,7 @@
-//! From sections to objects (CiA 306-1 V1.3, 4.6 and 5.3).
+//! From sections to objects (CiA 306-1 V1.4, 6.6 and 7).
 
-use super::ini::{self, Ini, Section};
+use super::ini::{self, Ini, Key, Section};
+use super::made::{compact_communication, compact_mapping, made};
 use super::value;
 use super::{Commissioning, DeviceInfo, Diag, Eds, EdsEntry, EdsError, EdsObject, List, Value, limit};
 use crate::protocol::data_type::{DataType, Number};
@@ -30,11 +31,13 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Eds, EdsError> {
     parser.objects()?;
     parser.lists();
     parser.compact_pdos(&device);
+    parser.modules();
     if parser.objects.is_empty() {
         return Err(EdsError::NoObjects);
     }
     let (mut warnings, objects) = (parser.diags, parser.objects);
     warnings.sort_by_key(|diag| diag.line);
+    let mut warnings = super::thin_out(warnings);
     if warnings.len() > limit::WARNINGS {
         let more = warnings.len() - limit::WARNINGS;
         warnings.truncate(limit::WARNINGS);
@@ -54,6 +57,8 @@ struct Parser<'a> {
 enum Kind {
     Object(u16),
     Sub(u16, u8),
+    /// As a sub-object's, with a number that is none.
+    NoSub,
     /// `Name`, `Value`, `Denotation`: one key for each sub-object of a `CompactSubObj`.
     Compact(u16),
     Other,
@@ -71,7 +76,8 @@ fn kind(name: &str) -> Kind {
         "name" | "value" | "denotation" => Kind::Compact(index),
         _ => match rest.strip_prefix("sub").map(|sub| u8::from_str_radix(sub, 16)) {
             Some(Ok(sub)) => Kind::Sub(index, sub),
-            _ => Kind::Other,
+            Some(Err(_)) => Kind::NoSub,
+            None => Kind::Other,
         },
     }
 }
@@ -184,6 +190,10 @@ impl Parser<'_> {
             match kind(&section.name) {
                 Kind::Sub(index, sub) => self.sub(section, index, sub),
                 Kind::Compact(index) => self.compact(section, index),
+                Kind::NoSub => {
+                    let text = "no sub-index (hexadecimal, 0 to FE) behind 'sub': the section is left out";
+                    self.warn(section, "", text.to_owned());
+                }
                 Kind::Object(_) | Kind::Other => {}
             }
             if self.entries > od::limit::ENTRIES {
@@ -244,7 +254,7 @@ impl Parser<'_> {
         name
     }
 
-    /// `CompactSubObj`: sub-index 0 and so many elements like the object itself (CiA 306-1 V1.3, 4.6.3).
+    /// `CompactSubObj`: sub-index 0 and so many elements like the object itself (CiA 306-1).
     fn compact_subs(&mut self, section: &Section, object: &mut EdsObject) {
         let count = object.compact.min(0xFE);
         let element = self.entry(section, ObjectCode::Var, &object.name);
@@ -266,7 +276,7 @@ impl Parser<'_> {
         }
         let what = ini::fold(&section.name);
         for key in &section.keys {
-            if key.key.eq_ignore_ascii_case("NrOfEntries") {
+            if key.is("NrOfEntries") {
                 continue;
             }
             let sub = value::unsigned(&key.key).ok().and_then(|(sub, _)| u8::try_from(sub).ok());
@@ -324,10 +334,10 @@ impl Parser<'_> {
     }
 
     fn entry(&mut self, section: &Section, code: ObjectCode, name: &str) -> EdsEntry {
-        let data_type = self.data_type(section, code);
+        let (data_type, own) = self.data_type(section, code);
         let flags = self.number(section, "ObjFlags").unwrap_or(0);
-        let low = self.limit(section, "LowLimit", data_type);
-        let high = self.limit(section, "HighLimit", data_type);
+        let low = self.limit(section, "LowLimit", data_type).or_else(|| self.type_limit(own, 2, data_type));
+        let high = self.limit(section, "HighLimit", data_type).or_else(|| self.type_limit(own, 3, data_type));
         let (low, high) = self.limits(section, low, high);
         EdsEntry {
             name: name.to_owned(),
@@ -347,9 +357,44 @@ impl Parser<'_> {
         }
     }
 
-    fn data_type(&mut self, section: &Section, code: ObjectCode) -> DataType {
+    /// The type, and its index if the file itself describes it.
+    fn data_type(&mut self, section: &Section, code: ObjectCode) -> (DataType, Option<u16>) {
+        let word = section.text("DataType");
+        if let Some(named) = DataType::all().find(|known| known.name().eq_ignore_ascii_case(word)) {
+            let text = format!("'{word}' is no number: taken as {:04X}h", named.index());
+            self.warn(section, "DataType", text);
+            let index = Some(named.index());
+            return (self.standard_type(section, code, index), None);
+        }
         let number = self.number(section, "DataType");
         let found = number.and_then(|number| u16::try_from(number).ok()).filter(|&index| index != 0);
+        if let Some(index) = found
+            && let Some(base) = self.type_field(index, 1).and_then(|base| value::unsigned(&base.value).ok())
+            && let Ok(base) = u16::try_from(base.0).map(DataType::from_index)
+            && base.size().is_some()
+        {
+            return (base, Some(index));
+        }
+        let data_type = self.standard_type(section, code, found);
+        (data_type, None)
+    }
+
+    /// Sub-object `sub` of a type that the file describes itself, as CANFestival's editor does for a type with limits:
+    /// section `[A0]` (two digits, so no object's), its sub-objects 1 base type, 2 lowest, 3 highest value.
+    fn type_field(&self, index: u16, sub: u8) -> Option<&Key> {
+        let ini = self.ini;
+        (0x24..0x1000)
+            .contains(&index)
+            .then(|| ini.get(&format!("{index:X}sub{sub:X}")))??
+            .get("DefaultValue")
+    }
+
+    fn type_limit(&self, own: Option<u16>, sub: u8, data_type: DataType) -> Option<Number> {
+        let limit = self.type_field(own?, sub)?;
+        value::limit(&limit.value, data_type).ok()?.0
+    }
+
+    fn standard_type(&mut self, section: &Section, code: ObjectCode, found: Option<u16>) -> DataType {
         match found.map(DataType::from_index) {
             Some(record) if record.is_record() => {
                 self.warn(section, "DataType", format!("{record} is a record type: taken as DOMAIN"));
@@ -367,7 +412,7 @@ impl Parser<'_> {
     }
 
     fn access(&mut self, section: &Section) -> Access {
-        let word = section.text("AccessType");
+        let word = section.text("AccessType").split([';', '#']).next().unwrap_or("").trim();
         if let Some(access) = Access::from_word(word) {
             return access;
         }
@@ -468,7 +513,7 @@ impl Parser<'_> {
             let Some(section) = self.ini.get(name) else { continue };
             let mut count = 0u64;
             for key in &section.keys {
-                if key.key.eq_ignore_ascii_case("SupportedObjects") {
+                if key.is("SupportedObjects") {
                     continue;
                 }
                 count += 1;
@@ -503,7 +548,18 @@ impl Parser<'_> {
         }
     }
 
-    /// `CompactPDO`: PDOs the file counts but does not describe (CiA 306-1 V1.3, 4.4).
+    /// Modular devices (CiA 306-1 V1.4, 8): their modules' objects are nobody's until a device is put together.
+    fn modules(&mut self) {
+        let Some(section) = self.ini.get("SupportedModules") else { return };
+        let count = self.number(section, "NrOfEntries").unwrap_or(0);
+        if count > 0 {
+            let text =
+                format!("the objects of the {count} modules are not read, only those of the device itself");
+            self.warn(section, "", text);
+        }
+    }
+
+    /// `CompactPDO`: PDOs the file counts but does not describe (CiA 306-1).
     fn compact_pdos(&mut self, device: &DeviceInfo) {
         if device.compact_pdo == 0 {
             return;
@@ -520,72 +576,4 @@ impl Parser<'_> {
             }
         }
     }
-}
-
-/// An entry that no section describes.
-fn made(name: &str, data_type: DataType, access: Access) -> EdsEntry {
-    EdsEntry {
-        name: name.to_owned(),
-        data_type,
-        access,
-        mappable: false,
-        default: None,
-        parameter: None,
-        low: None,
-        high: None,
-        no_download: false,
-        no_scan: false,
-        denotation: String::new(),
-        upload_file: String::new(),
-        download_file: String::new(),
-        line: 0,
-    }
-}
-
-fn made_object(name: String, subs: BTreeMap<u8, EdsEntry>) -> EdsObject {
-    EdsObject { name, code: ObjectCode::Record, list: List::None, line: 0, compact: 0, subs }
-}
-
-/// PDO communication parameters (CiA 301 V4.2, 7.5.2.35 and 7.5.2.37) with the sub-indices of the mask.
-fn compact_communication(what: &str, mask: u8, n: u16, cob_id: u32) -> EdsObject {
-    let fields = [
-        (1, "COB-ID", DataType::Unsigned32),
-        (2, "Transmission type", DataType::Unsigned8),
-        (3, "Inhibit time", DataType::Unsigned16),
-        (4, "Reserved", DataType::Unsigned8),
-        (5, "Event timer", DataType::Unsigned16),
-        (6, "SYNC start value", DataType::Unsigned8),
-    ];
-    let mut subs = BTreeMap::new();
-    let mut highest = 0;
-    for (sub, name, data_type) in fields {
-        if mask & 1 << (sub - 1) == 0 {
-            continue;
-        }
-        let mut entry = made(name, data_type, Access::Rw);
-        if sub == 1 {
-            // The first four follow the predefined connection set, the others do not exist yet (7.3.5).
-            let (id, node_relative) =
-                if n < 4 { (cob_id + 0x100 * u32::from(n), true) } else { (1 << 31, false) };
-            entry.default = Some(Value { bytes: id.to_le_bytes().to_vec(), node_relative });
-        } else if sub == 2 {
-            entry.default = Some(Value { bytes: vec![0xFF], node_relative: false });
-        }
-        subs.insert(sub, entry);
-        highest = sub;
-    }
-    let mut zero = made("Highest sub-index supported", DataType::Unsigned8, Access::Const);
-    zero.default = Some(Value { bytes: vec![highest], node_relative: false });
-    subs.insert(0, zero);
-    made_object(format!("{what} {} communication parameter", n + 1), subs)
-}
-
-/// PDO mapping parameters (CiA 301 V4.2, 7.5.2.36 and 7.5.2.38), nothing mapped.
-fn compact_mapping(what: &str, entries: u8) -> EdsObject {
-    let mut subs = BTreeMap::new();
-    subs.insert(0, made("Number of mapped objects", DataType::Unsigned8, Access::Rw));
-    for sub in 1..=entries {
-        subs.insert(sub, made(&format!("Mapped object {sub}"), DataType::Unsigned32, Access::Rw));
-    }
-    made_object(format!("{what} mapping parameter"), subs)
 }

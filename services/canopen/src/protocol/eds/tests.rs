@@ -303,7 +303,7 @@ fn what_is_no_eds_is_refused() {
         all
     });
     assert_eq!(Eds::parse(many.as_bytes()), Err(EdsError::TooManyEntries));
-    let warnings = format!("[1000]\n{}", "no key\n".repeat(3000));
+    let warnings = (0..3000).fold("[1000]\n".to_owned(), |all, n| format!("{all}no key {n}\n"));
     let eds = Eds::parse(warnings.as_bytes()).unwrap();
     assert_eq!(eds.warnings.len(), limit::WARNINGS + 1);
 }
@@ -356,7 +356,7 @@ fn a_dcf_gives_back_what_went_in() {
             .entries()
             .filter(|(_, _, entry)| entry.access.writable() && !entry.no_download)
             .enumerate()
-            .map(|(n, (index, sub, entry))| (index, sub, other(entry, n as u8 + 1)))
+            .map(|(n, (index, sub, entry))| (index, sub, other(entry, (n as u8).wrapping_add(1))))
             .filter(|(_, _, bytes)| !bytes.is_empty())
             .collect();
         let commissioning = Commissioning {

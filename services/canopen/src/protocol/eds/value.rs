@@ -1,4 +1,4 @@
-//! Values as they are written in an EDS or DCF (CiA 306-1 V1.3, 4.6.1): numbers decimal, hexadecimal (`0x`) or
+//! Values as they are written in an EDS or DCF (CiA 306-1): numbers decimal, hexadecimal (`0x`) or
 //! octal (leading 0), formulas with `$NODEID`, text, bytes.
 
 use crate::protocol::data_type::{DataType, Number};
@@ -30,8 +30,23 @@ pub(super) fn integer(text: &str) -> Parsed<i128> {
         Some(rest) => (true, rest.trim_start()),
         None => (false, number.strip_prefix('+').unwrap_or(number)),
     };
+    let digits = digits.strip_suffix(['u', 'U', 'l', 'L']).unwrap_or(digits);
+    let hex = |digits: &str| digits.bytes().all(|b| b.is_ascii_hexdigit());
     let (radix, digits) = match digits.get(..2) {
-        Some("0x" | "0X") => (16, &digits[2..]),
+        Some("0x" | "0X") => (16, digits[2..].strip_suffix(['h', 'H']).unwrap_or(&digits[2..])),
+        _ if digits.len() > 1 && digits.ends_with(['h', 'H']) && hex(&digits[..digits.len() - 1]) => {
+            remark = Some(format!("'{text}' ends with h: taken as hexadecimal"));
+            (16, &digits[..digits.len() - 1])
+        }
+        // `000F0191` can be nothing else; `1E3`, `FADE` could.
+        _ if digits.starts_with('0')
+            && digits.len() >= 4
+            && hex(digits)
+            && !digits.bytes().all(|b| b.is_ascii_digit()) =>
+        {
+            remark = Some(format!("'{text}' has no 0x in front: taken as hexadecimal"));
+            (16, digits)
+        }
         _ if digits.len() > 1 && digits.starts_with('0') && digits.bytes().all(|b| b.is_ascii_digit()) => {
             if digits.bytes().all(|byte| byte < b'8') {
                 (8, &digits[1..])
@@ -42,7 +57,6 @@ pub(super) fn integer(text: &str) -> Parsed<i128> {
         }
         _ => (10, digits),
     };
-    let digits = digits.strip_suffix(['u', 'U', 'l', 'L', 'h', 'H']).unwrap_or(digits);
     if digits.is_empty() || digits.starts_with(['+', '-']) {
         return Err(format!("'{}' is no number", super::ini::short(text)));
     }
@@ -136,13 +150,14 @@ fn fit(number: i128, text: &str, data_type: DataType) -> Result<Vec<u8>, String>
 /// The sum of numbers and, at most once, `$NODEID`.
 fn formula(text: &str) -> Result<(i128, bool, Option<String>), String> {
     let upper = text.to_ascii_uppercase();
-    let Some(at) = upper.find("$NODEID") else {
-        let (number, remark) = integer(text)?;
+    let Some((at, len)) = upper.find("$NODEID").map(|at| (at, 7)).or(upper.find("NODEID").map(|at| (at, 6)))
+    else {
+        let (number, remark) = integer(text).or_else(|fault| whole_real(text).ok_or(fault))?;
         return Ok((number, false, remark));
     };
-    let (before, behind) = (text[..at].trim(), text[at + 7..].trim());
+    let (before, behind) = (text[..at].trim(), text[at + len..].trim());
     let bad = || format!("'{}' is no sum of a number and $NODEID", super::ini::short(text));
-    let (mut sum, mut remark) = (0, None);
+    let (mut sum, mut remark) = (0, (len == 6).then(|| "NODEID without '$': taken as $NODEID".to_owned()));
     for part in [before.strip_suffix('+').unwrap_or(before), behind.strip_prefix('+').unwrap_or(behind)] {
         if part.trim().is_empty() {
             continue;
@@ -159,6 +174,16 @@ fn formula(text: &str) -> Result<(i128, bool, Option<String>), String> {
         return Err(bad());
     }
     Ok((sum, true, remark))
+}
+
+/// A real without a fraction where an integer belongs (`0.0`).
+fn whole_real(text: &str) -> Option<(i128, Option<String>)> {
+    let (number, _) = strip(text);
+    let value: f64 = number.parse().ok()?;
+    let whole = number.contains('.') && value.fract() == 0.0 && value.abs() < 9e15;
+    whole.then(|| {
+        (value as i128, Some(format!("'{number}' is a real, the object an integer: taken as {value:.0}")))
+    })
 }
 
 /// A real, decimal or as its bits in hexadecimal. Bits are taken as they are: a conversion would make a signalling

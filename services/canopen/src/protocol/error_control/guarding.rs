@@ -44,6 +44,11 @@ impl GuardedSlave {
             self.lost = false;
         }
     }
+    /// The heartbeat producer was turned on: nobody asks any more, and nobody is missed.
+    pub fn stand_down(&mut self) {
+        self.deadline_ns = None;
+        self.lost = false;
+    }
     /// Initialisation: the first answer has toggle 0 again.
     pub fn reset(&mut self) {
         *self = Self { life_ns: self.life_ns, ..Self::default() };

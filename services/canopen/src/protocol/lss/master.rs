@@ -45,7 +45,8 @@ pub struct LssRange {
 }
 
 /// What fastscan knows beforehand: a part that is given is taken as it is and only confirmed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct FastscanHint {
     pub vendor: Option<u32>,
     pub product: Option<u32>,
@@ -89,7 +90,7 @@ pub enum LssResult {
     Found(LssAddress),
     /// No answer in time: there is no such slave.
     Nobody,
-    /// The slave refused: error code and specific error (CiA 305 V3.0, 5.4: 1 = out of range or not supported,
+    /// The slave refused: error code and specific error (CiA 305 V3.0, 6.4: 1 = out of range or not supported,
     /// FFh = the slave's own).
     Refused { code: u8, specific: u8 },
     /// Fastscan: slaves answered, but none to the whole address: frames were lost, or a slave is faulty. Try again.
@@ -147,6 +148,10 @@ pub struct LssMaster {
 impl LssMaster {
     pub fn new(times: LssTimes) -> Self {
         Self { times, job: None, free_at_ns: 0 }
+    }
+    /// Other times, from the next wait on.
+    pub fn set_times(&mut self, times: LssTimes) {
+        self.times = times;
     }
     pub fn is_busy(&self) -> bool {
         self.job.is_some()
@@ -242,7 +247,7 @@ impl LssMaster {
             _ => self.finish(LssResult::Done),
         }
     }
-    /// One step of fastscan (CiA 305 V3.0, 5.7.3, figure 10): `yes` if any slave answered the last question.
+    /// One step of fastscan (CiA 305 V3.0, 6.7, figure 46): `yes` if any slave answered the last question.
     fn scan_step(&mut self, t_ns: u64, yes: bool) -> Option<LssResult> {
         let job = self.job.as_mut()?;
         let scan = job.scan.as_mut()?;

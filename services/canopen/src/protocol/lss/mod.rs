@@ -6,13 +6,14 @@ pub mod master;
 pub mod slave;
 
 use ipc_types::payload::CanFrame;
+use serde::{Deserialize, Serialize};
 
 use super::cob_id::predefined;
 
-/// Node-id of a device that has none (CiA 305 V3.0, 4.4).
+/// Node-id of a device that has none (CiA 305 V3.0).
 pub const UNCONFIGURED: u8 = 0xFF;
 
-/// Command specifiers (CiA 305 V3.0, 5.3 to 5.7).
+/// Command specifiers (CiA 305 V3.0, 6.3 to 6.7, figures 31 to 46).
 pub mod cs {
     pub const SWITCH_GLOBAL: u8 = 0x04;
     pub const CONFIGURE_NODE_ID: u8 = 0x11;
@@ -41,13 +42,14 @@ pub mod cs {
     pub const INQUIRE_NODE_ID: u8 = 0x5E;
 }
 
-/// Bit timing table 0 (CiA 305 V3.0, 5.4.2, table 1; CiA 301 V4.2, 5.4): index -> kbit/s; 0 = reserved.
+/// Bit timing table 0 (CiA 305 V3.0, 6.4.3): index -> kbit/s; 0 = reserved.
 pub const BIT_TIMING_KBIT: [u16; 10] = [1000, 800, 500, 250, 125, 0, 50, 20, 10, 0];
 /// Index of automatic bit rate detection.
 pub const BIT_TIMING_AUTO: u8 = 9;
 
-/// The LSS address: the identity object 1018h (CiA 305 V3.0, 4.3).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash)]
+/// The LSS address: the identity object 1018h (CiA 305 V3.0).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct LssAddress {
     pub vendor: u32,
     pub product: u32,
@@ -65,8 +67,9 @@ impl LssAddress {
     }
 }
 
-/// States of an LSS slave (CiA 305 V3.0, 4.4.1).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+/// States of an LSS slave (CiA 305 V3.0).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum LssState {
     #[default]

@@ -9,7 +9,7 @@ use crate::protocol::io::Outbox;
 /// What the owner has to do, or may want to know.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LssSlaveEvent {
-    /// The device had no node-id and has one now: it starts with it (CiA 305 V3.0, 4.4.2).
+    /// The device had no node-id and has one now: it starts with it (CiA 305 V3.0).
     NodeIdActive { node_id: u8 },
     /// Another node-id was given; it takes effect at the next reset communication.
     NodeIdPending { node_id: u8 },
@@ -80,9 +80,11 @@ impl LssSlave {
     pub fn pending_node_id(&self) -> u8 {
         self.pending_node_id
     }
-    /// Reset communication took the pending node-id.
-    pub fn node_id_taken(&mut self) {
+    /// The node was reset: the pending node-id is the active one, and a slave that was being configured waits again.
+    pub fn reset(&mut self) -> Option<LssSlaveEvent> {
         self.active_node_id = self.pending_node_id;
+        (self.identified, self.fastscan_at) = (0, 0);
+        self.enter(LssState::Waiting)
     }
     fn enter(&mut self, state: LssState) -> Option<LssSlaveEvent> {
         self.selected = 0;
@@ -112,7 +114,7 @@ impl LssSlave {
                 None
             }
             cs::IDENTIFY_NON_CONFIGURED => {
-                // Answered by devices without node-id, neither active nor pending (5.7.2).
+                // Answered by devices without node-id, neither active nor pending (CiA 305 V3.0, figure 44).
                 if self.active_node_id == UNCONFIGURED && self.pending_node_id == UNCONFIGURED {
                     answer(cs::NON_CONFIGURED_ANSWER, [0; 7], out);
                 }
@@ -123,7 +125,7 @@ impl LssSlave {
             _ => None,
         }
     }
-    /// Vendor, product, revision, serial, in this order; a wrong one starts it anew (5.3.2).
+    /// Vendor, product, revision, serial, in this order; a wrong one starts it anew (CiA 305 V3.0, figure 32).
     fn switch_selective(&mut self, data: &[u8; 8], out: &mut Outbox) -> Option<LssSlaveEvent> {
         if self.state != LssState::Waiting {
             return None;
@@ -144,7 +146,7 @@ impl LssSlave {
         answer(cs::SWITCH_SELECTIVE_ANSWER, [0; 7], out);
         event
     }
-    /// Vendor and product exactly, revision and serial within a range (5.7.1).
+    /// Vendor and product exactly, revision and serial within a range (CiA 305 V3.0, figure 42).
     fn identify(&mut self, data: &[u8; 8], out: &mut Outbox) {
         let value = u32_of(data);
         let own = &self.address;
@@ -166,7 +168,8 @@ impl LssSlave {
             answer(cs::IDENTIFY_ANSWER, [0; 7], out);
         }
     }
-    /// Takes part while without node-id and waiting (5.7.3). Bytes: IDNumber, BitCheck, LSSSub, LSSNext.
+    /// Takes part while without node-id and waiting (CiA 305 V3.0, 6.7, figure 46). Bytes: IDNumber, BitCheck, LSSSub,
+    /// LSSNext.
     fn fastscan(&mut self, data: &[u8; 8], out: &mut Outbox) -> Option<LssSlaveEvent> {
         if self.active_node_id != UNCONFIGURED
             || self.pending_node_id != UNCONFIGURED
@@ -188,12 +191,10 @@ impl LssSlave {
             return None;
         }
         let mut event = None;
-        if bit_check == 0 {
-            // The whole part matched: on with the next, or chosen if the cycle is through.
-            self.fastscan_at = next;
-            if next < sub {
-                event = self.enter(LssState::Configuration);
-            }
+        self.fastscan_at = next;
+        if bit_check == 0 && next < sub {
+            // The last part matched whole: this slave is the one.
+            event = self.enter(LssState::Configuration);
         }
         answer(cs::IDENTIFY_ANSWER, [0; 7], out);
         event
@@ -202,7 +203,7 @@ impl LssSlave {
         let own = self.address;
         match data[0] {
             cs::CONFIGURE_NODE_ID => {
-                // 5.4.1: error code 1 = node-id out of range.
+                // Figure 33: error code 1 = node-id out of range.
                 let right = matches!(data[1], 1..=127 | UNCONFIGURED);
                 if right {
                     self.pending_node_id = data[1];
@@ -211,7 +212,7 @@ impl LssSlave {
                 right.then_some(LssSlaveEvent::NodeIdPending { node_id: data[1] })
             }
             cs::CONFIGURE_BIT_TIMING => {
-                // 5.4.2: error code 1 = bit timing not supported. Table selector 0 = CiA.
+                // Figure 34: error code 1 = bit timing not supported. Table selector 0 = CiA.
                 let (table, index) = (data[1], data[2]);
                 let right = table == 0 && index < 16 && self.abilities.bit_timing & (1 << index) != 0;
                 let kbit = BIT_TIMING_KBIT.get(usize::from(index)).copied().unwrap_or(0);
@@ -228,7 +229,7 @@ impl LssSlave {
                     .then_some(LssSlaveEvent::ActivateBitTiming { kbit: self.pending_kbit, delay_ms })
             }
             cs::STORE => {
-                // 5.4.4: error code 1 = storing not supported.
+                // Figure 36: error code 1 = storing not supported.
                 answer(cs::STORE, [u8::from(!self.abilities.store), 0, 0, 0, 0, 0, 0], out);
                 let (node_id, kbit) = (self.pending_node_id, self.pending_kbit);
                 self.abilities.store.then_some(LssSlaveEvent::Store { node_id, kbit })
@@ -239,7 +240,10 @@ impl LssSlave {
                 None
             }
             cs::INQUIRE_NODE_ID => {
-                answer(cs::INQUIRE_NODE_ID, [self.active_node_id, 0, 0, 0, 0, 0, 0], out);
+                // A device that has no node-id yet tells the one it is going to have (6.5.3).
+                let configured = self.active_node_id != UNCONFIGURED;
+                let node_id = if configured { self.active_node_id } else { self.pending_node_id };
+                answer(cs::INQUIRE_NODE_ID, [node_id, 0, 0, 0, 0, 0, 0], out);
                 None
             }
             _ => None,

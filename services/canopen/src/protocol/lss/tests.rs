@@ -147,6 +147,31 @@ fn selective_services() {
 }
 
 #[test]
+fn a_device_without_node_id_tells_the_one_it_was_given() {
+    let mut bus = Bus::new(vec![slave(1, UNCONFIGURED)]);
+    bus.run(LssRequest::SwitchGlobal(LssState::Configuration));
+    assert_eq!(bus.run(LssRequest::Inquire(Inquiry::NodeId)), LssResult::Value(0xFF));
+    assert_eq!(bus.run(LssRequest::ConfigureNodeId(9)), LssResult::Done);
+    assert_eq!(bus.run(LssRequest::Inquire(Inquiry::NodeId)), LssResult::Value(9));
+}
+
+#[test]
+fn a_reset_ends_the_configuration() {
+    let mut device = slave(1, 5);
+    let mut out = Outbox::default();
+    let mut say = |device: &mut LssSlave, data: [u8; 8]| {
+        device.on_frame(&CanFrame::classic(predefined::LSS_MASTER, &data), &mut out);
+        out.drain().count()
+    };
+    assert_eq!(device.reset(), None);
+    say(&mut device, [cs::SWITCH_GLOBAL, 1, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(say(&mut device, [cs::CONFIGURE_NODE_ID, 9, 0, 0, 0, 0, 0, 0]), 1);
+    assert_eq!(device.reset(), Some(LssSlaveEvent::State(LssState::Waiting)));
+    assert_eq!((device.state(), device.pending_node_id()), (LssState::Waiting, 9));
+    assert_eq!(say(&mut device, [cs::INQUIRE_NODE_ID, 0, 0, 0, 0, 0, 0, 0]), 0);
+}
+
+#[test]
 fn storing_can_be_impossible() {
     let unable = LssAbilities { store: false, bit_timing: 0 };
     let mut bus = Bus::new(vec![LssSlave::new(address(1), 5, unable)]);

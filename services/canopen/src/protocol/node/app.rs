@@ -75,9 +75,10 @@ impl Node {
     pub fn set_quietly(&mut self, entry: EntryRef, data: &[u8]) -> Result<(), Abort> {
         self.od.set(entry, data)
     }
-    /// The event of TPDOs that map this object, whether its value changed or not.
-    pub fn changed(&mut self, t_ns: u64, index: u16, sub: u8, out: &mut Outbox) {
-        self.com.pdos.object_changed(t_ns, &self.od, index, sub, out);
+    /// One event of the TPDOs that map any of these objects, whether their values changed or not: a TPDO that maps
+    /// several of them goes out once.
+    pub fn changed(&mut self, t_ns: u64, objects: &[(u16, u8)], out: &mut Outbox) {
+        self.com.pdos.objects_changed(t_ns, &self.od, objects, out);
     }
     /// The event of one TPDO (0-based).
     pub fn trigger_tpdo(&mut self, t_ns: u64, number: u16, out: &mut Outbox) {

@@ -93,7 +93,14 @@ impl Com {
                 }
                 self.consumer.configure(sub, value);
             }
-            HEARTBEAT_PRODUCER => self.heartbeat.configure(t_ns, od.u16(HEARTBEAT_PRODUCER, 0).unwrap_or(0)),
+            HEARTBEAT_PRODUCER => {
+                self.heartbeat.configure(t_ns, od.u16(HEARTBEAT_PRODUCER, 0).unwrap_or(0));
+                // Heartbeat and guarding exclude each other; heartbeat wins (7.2.8.2.2).
+                if self.heartbeat.is_on() {
+                    self.guarded.stand_down();
+                    self.clear(emcy::code::HEARTBEAT, 0);
+                }
+            }
             EMCY_CONSUMER if sub > 0 => {
                 self.emcy_consumer.configure(sub, CobId(od.u32(index, sub).unwrap_or(BIT_31)));
             }

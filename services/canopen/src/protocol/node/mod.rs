@@ -114,7 +114,9 @@ impl Node {
         com.collided = false;
         if let Some(lss) = &mut com.lss {
             com.node_id = lss.pending_node_id();
-            lss.node_id_taken();
+            if let Some(event) = lss.reset() {
+                com.events.push(NodeEvent::Lss(event));
+            }
         }
         self.servers.reset();
         if com.node_id == UNCONFIGURED {

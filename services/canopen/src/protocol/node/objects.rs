@@ -30,7 +30,7 @@ pub mod object {
     pub const SYNC_OVERFLOW: u16 = 0x1019;
     pub const EMCY_CONSUMER: u16 = 0x1028;
     pub const ERROR_BEHAVIOUR: u16 = 0x1029;
-    /// CiA 302-2 V4.1, 5.3.1.
+    /// CiA 302-2 V4.1.
     pub const NMT_STARTUP: u16 = 0x1F80;
 }
 use object::*;
@@ -39,6 +39,8 @@ use object::*;
 pub fn check_write(od: &ObjectDictionary, index: u16, sub: u8, data: &[u8]) -> Result<(), Abort> {
     let value = unsigned(data.get(..8).unwrap_or(data)) as u32;
     match index {
+        // 7.5.2.4: a 0 to sub-index 0 empties the history, nothing else can be written.
+        ERROR_FIELD if sub > 0 => Err(Abort::READ_ONLY),
         ERROR_FIELD if value != 0 => Err(Abort::INVALID_VALUE),
         SYNC_COB_ID => sync_cob_id(od, CobId(value)),
         TIME_COB_ID => time_cob_id(od, CobId(value)),

@@ -1,4 +1,5 @@
 use super::*;
+use crate::protocol::cob_id::CobId;
 use crate::protocol::data_type::DataType;
 use crate::protocol::emcy::Emcy;
 use crate::protocol::error_control::MS;
@@ -310,6 +311,23 @@ fn a_lost_heartbeat_follows_1029() {
 }
 
 #[test]
+fn a_master_that_turns_to_heartbeat_is_not_missed_as_guard() {
+    for heartbeat in [0u16, 50] {
+        let mut bench = Bench::new(4);
+        bench.set(0x100C, 0, 100);
+        bench.set(0x100D, 0, 2);
+        bench.start();
+        bench.node.on_frame(0, &CobId(0x704).remote(1), &mut bench.out);
+        assert_eq!(bench.sent(), [(0x704, vec![5])]);
+        assert_eq!(bench.sdo(0x1017, 0, &heartbeat.to_le_bytes()), 0);
+        let lost = bench.until(1000).iter().any(|(id, data)| *id == 0x84 && data[..2] == [0x30, 0x81]);
+        assert_eq!(lost, heartbeat == 0);
+        let state = if lost { NmtState::PreOperational } else { NmtState::Operational };
+        assert_eq!(bench.node.state(), state);
+    }
+}
+
+#[test]
 fn lss_gives_a_node_id_and_the_node_boots_with_it() {
     let mut bench = Bench::with(builder().build(0).unwrap(), UNCONFIGURED, &[]);
     assert!(bench.sent().is_empty());
@@ -325,6 +343,10 @@ fn lss_gives_a_node_id_and_the_node_boots_with_it() {
     bench.frame(0x7E5, &[4, 0, 0, 0, 0, 0, 0, 0]);
     assert_eq!(bench.node.node_id(), 9);
     assert_eq!(bench.frame(0, &[130, 9]), [(0x70A, vec![0])]);
+    // A reset in the middle of a configuration: the slave waits again, and is not asked as if it were configured.
+    bench.frame(0x7E5, &[4, 1, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(bench.frame(0, &[130, 10]), [(0x70A, vec![0])]);
+    assert!(bench.frame(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0]).is_empty());
 }
 
 #[test]

@@ -65,7 +65,7 @@ impl ObjectCode {
     }
 }
 
-/// Access rights (CiA 301 V4.2, 7.4.5, table 43; `rwr` and `rww` CiA 306-1, 4.6.1).
+/// Access rights (CiA 301 V4.2, 7.4.5, table 43; `rwr` and `rww` CiA 306-1).
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Access {
     Ro,

@@ -204,6 +204,26 @@ impl Pdos {
             self.tpdos[usize::from(at)].trigger(t_ns, od, out);
         }
     }
+    /// Several objects changed as one: every TPDO that maps any of them has one event, and goes out once.
+    pub fn objects_changed(
+        &mut self,
+        t_ns: u64,
+        od: &ObjectDictionary,
+        objects: &[(u16, u8)],
+        out: &mut Outbox,
+    ) {
+        if !self.operational || objects.is_empty() {
+            return;
+        }
+        for &(index, sub) in objects {
+            for &(_, at) in matching(&self.by_object, object_key(index, sub)) {
+                self.tpdos[usize::from(at)].mark();
+            }
+        }
+        for tpdo in &mut self.tpdos {
+            tpdo.trigger_marked(t_ns, od, out);
+        }
+    }
     /// The application's event for one TPDO (0-based).
     pub fn trigger(&mut self, t_ns: u64, od: &ObjectDictionary, number: u16, out: &mut Outbox) {
         if !self.operational {

@@ -25,6 +25,8 @@ pub struct Tpdo {
     pub(super) mapping: Mapping,
     /// An event waits for SYNC (type 0) or for the end of the inhibit time (254, 255).
     event: bool,
+    /// Several objects change as one, and this PDO maps some of them.
+    marked: bool,
     /// Of type 252: what the last SYNC sampled.
     sample: Option<[u8; 8]>,
     inhibited_until_ns: u64,
@@ -42,6 +44,7 @@ impl Tpdo {
             communication: Communication::load(od, Direction::Transmit.communication(number)),
             mapping: Mapping::default(),
             event: false,
+            marked: false,
             sample: None,
             inhibited_until_ns: 0,
             event_timer_ns: None,
@@ -114,6 +117,16 @@ impl Tpdo {
             } else {
                 self.event = true;
             }
+        }
+    }
+    /// An event of several objects is about this PDO too.
+    pub(super) fn mark(&mut self) {
+        self.marked = true;
+    }
+    /// The event, if it is about this PDO.
+    pub(super) fn trigger_marked(&mut self, t_ns: u64, od: &ObjectDictionary, out: &mut Outbox) {
+        if std::mem::take(&mut self.marked) {
+            self.trigger(t_ns, od, out);
         }
     }
     /// A remote frame asks for the PDO (7.2.2.5.2), unless bit 30 of the COB-ID forbids it. Type 252 answers with

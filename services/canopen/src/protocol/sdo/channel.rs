@@ -2,6 +2,7 @@
 //! them (CiA 301 V4.2, 7.5.2.33 and 7.5.2.34).
 
 use crate::protocol::abort::Abort;
+use crate::protocol::cob_id::is_restricted;
 use crate::protocol::data_type::unsigned;
 use crate::protocol::od::ObjectDictionary;
 use ipc_types::payload::id_flag;
@@ -75,11 +76,6 @@ pub fn client_channel(od: &ObjectDictionary, n: u8) -> Option<Channel> {
     })
 }
 
-/// Identifiers that no configurable object may use (7.3.5, table 40).
-pub fn restricted_can_id(id: u32) -> bool {
-    matches!(id, 0x000..=0x07F | 0x101..=0x180 | 0x581..=0x5FF | 0x601..=0x67F | 0x6E0..=0x6FF | 0x701..=0x7FF)
-}
-
 /// May the network write `data` to this sub-object of 1200-12FFh? For the owner's `before_write`; everything
 /// outside those objects is fine.
 ///
@@ -98,7 +94,7 @@ pub fn validate_parameter(od: &ObjectDictionary, index: u16, sub: u8, data: &[u8
             let standard = value & FRAME == 0;
             if (exists && changes)
                 || (standard && value & id_flag::EFF_MASK > id_flag::SFF_MASK)
-                || (value & INVALID == 0 && standard && restricted_can_id(value & id_flag::SFF_MASK))
+                || (value & INVALID == 0 && standard && is_restricted(value & id_flag::SFF_MASK))
             {
                 return Err(Abort::INVALID_VALUE);
             }

@@ -20,7 +20,7 @@ mod servers;
 mod tests;
 mod transfer;
 
-pub use channel::{Channel, client_channel, restricted_can_id, server_channel, validate_parameter};
+pub use channel::{Channel, client_channel, server_channel, validate_parameter};
 pub use client::SdoClient;
 pub use crc::crc16;
 pub use server::{SdoServer, ServerConfig, ServerCounters};

@@ -1,26 +1,13 @@
 //! What `<service>/status` shows.
 
-use super::super::ask::exception_words;
-use super::super::line::{LineCounters, UnitCounters, UnitState};
-use super::{EVENTS_A_SECOND, Runner, STATUS_UNITS, Service, Transport, Unsafe};
+use super::super::line::LineCounters;
+use super::super::unit_row::{UnitRow, unit_rows};
+use super::{Runner, STATUS_UNITS, Service, Transport};
 use ipc_types::event::{EventKind, Level};
+use ipc_types::outputs::Unsafe;
 use ipc_types::payload::Quality;
 use serde::Serialize;
 use serde_json::Value;
-
-#[derive(Serialize)]
-struct UnitRow {
-    unit: u8,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    name: Option<String>,
-    state: UnitState,
-    counters: UnitCounters,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    last_exception: Option<String>,
-    /// Of the last answer.
-    rtt_us: Option<u64>,
-    max_rtt_us: u64,
-}
 
 #[derive(Serialize)]
 struct LineRow {
@@ -53,11 +40,10 @@ pub(super) struct Status {
 
 impl Service {
     pub(super) fn status(&mut self) {
-        if self.events_left_out > 0 {
-            let message = format!("{} more changes in the last second left out", self.events_left_out);
+        if let Some(left_out) = self.events.renew() {
+            let message = format!("{left_out} more changes in the last second left out");
             self.ctx.event(EventKind::InputQuality, Level::Warning, message, Value::Null);
         }
-        (self.event_budget, self.events_left_out) = (EVENTS_A_SECOND, 0);
         let body = self.status_body(STATUS_UNITS);
         self.ctx.status(&body);
     }
@@ -72,7 +58,7 @@ impl Service {
             good: count(Quality::Good),
             stale: count(Quality::Stale),
             no_data: count(Quality::NoData),
-            safe: self.safe.filter(|_| self.image.is_some()),
+            safe: self.image.why(),
             jobs: self.jobs_done,
             jobs_failed: self.jobs_failed,
             images_too_small: self.writes.outside(),
@@ -81,22 +67,8 @@ impl Service {
 }
 
 fn line_row(runner: &Runner, left: &mut usize) -> LineRow {
-    let mut units = Vec::new();
-    for view in runner.line.units() {
-        if *left == 0 {
-            break;
-        }
-        *left -= 1;
-        units.push(UnitRow {
-            unit: view.unit,
-            name: runner.plan.units.iter().find(|u| u.unit == view.unit).and_then(|u| u.name.clone()),
-            state: view.state,
-            counters: view.counters,
-            last_exception: view.last_exception.map(|code| exception_words(code, 0)),
-            rtt_us: view.last_rtt_ns.map(|ns| ns / 1000),
-            max_rtt_us: view.max_rtt_ns / 1000,
-        });
-    }
+    let name_of = |unit| runner.plan.units.iter().find(|u| u.unit == unit).and_then(|u| u.name.clone());
+    let units = unit_rows(runner.line.units(), left, name_of);
     LineRow {
         target: runner.plan.target.to_string(),
         connected: matches!(runner.transport, Transport::Tcp(_)).then_some(runner.connected),

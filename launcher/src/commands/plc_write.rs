@@ -1,0 +1,413 @@
+//! `dinrail plc write` and `plc force`: every assignment is resolved and checked before the first is carried out.
+//!
+//! Several places in %Q and %M go to the engine as one message, applied whole in one scan. Variables of the program lie
+//! outside the image that such a message can name: with one of them among several, each is written by itself.
+
+use super::{UsageError, println};
+use crate::supervise::jobs::{JobError, JobLine};
+use dinrail_iec::artifact::{AreaKind, ElemType, Storage};
+use dinrail_iec::{AddressSize, Addressing, parse_address};
+use dinrail_modbus::service::addressing_of;
+use dinrail_plc::engine::value::Cell;
+use dinrail_plc::engine::write_result;
+use ipc_types::Context;
+use ipc_types::image_write::{Builder, MAX_BYTES, MAX_OPS, Op, WriteError};
+use ipc_types::payload::{Image, ImageWrite, acks};
+use ipc_types::port::{Publisher, Subscriber};
+use ipc_types::scan_record::Patch;
+use ipc_types::stack::Stack;
+use ipc_types::topic::TopicKind;
+use ipc_types::wiring::Area;
+use serde_json::{Value, json};
+use std::time::{Duration, Instant};
+
+/// How long a job or a message may take.
+const LIMIT: Duration = Duration::from_secs(5);
+/// How often the image is looked at for the acknowledgement.
+const LOOK: Duration = Duration::from_millis(2);
+
+/// A variable and what it shall be.
+pub type Assignment = (String, Value);
+
+const ELEMENTS: [ElemType; 16] = [
+    ElemType::Bool,
+    ElemType::Byte,
+    ElemType::Word,
+    ElemType::Dword,
+    ElemType::Lword,
+    ElemType::Sint,
+    ElemType::Int,
+    ElemType::Dint,
+    ElemType::Lint,
+    ElemType::Usint,
+    ElemType::Uint,
+    ElemType::Udint,
+    ElemType::Ulint,
+    ElemType::Real,
+    ElemType::Lreal,
+    ElemType::Time,
+];
+
+/// Asks the engine for every variable and compares its type with the value: nothing is carried out when one is wrong.
+///
+/// Says whether the engine knows all of them. Without a program it does not know the stack file's symbols, but their
+/// places are known here.
+pub fn check_all(
+    stack: &Stack,
+    line: &mut JobLine,
+    plc: &str,
+    list: &[Assignment],
+    what: &str,
+) -> anyhow::Result<bool> {
+    let (mut wrong, mut known) = (Vec::new(), true);
+    for (var, value) in list {
+        match line.ask(&json!({ "do": "read", "var": var }), LIMIT) {
+            Ok(answer) => wrong.extend(misfit(var, value, &answer)),
+            Err(JobError::Refused { text, .. }) => match place(stack, plc, var) {
+                Some((_, cell)) if !var.starts_with('%') => {
+                    known = false;
+                    wrong.extend(cell.patch(var, value).err().map(|e| e.to_string()));
+                }
+                _ => wrong.push(text),
+            },
+            Err(other) => return Err(other.into()),
+        }
+    }
+    if wrong.is_empty() {
+        return Ok(known);
+    }
+    let none = if list.len() > 1 { format!("nothing was {what}: ") } else { String::new() };
+    anyhow::bail!("{none}{}", wrong.join("; "))
+}
+
+/// Why a value cannot be this variable's, by what `read` says of it. A type that is not known here is left to the engine.
+fn misfit(var: &str, value: &Value, answer: &Value) -> Option<String> {
+    let type_name = answer.get("type").and_then(Value::as_str)?;
+    if type_name.starts_with("ARRAY") {
+        return Some(format!("'{var}' is an array: write its elements, like {var}[1]"));
+    }
+    let word = type_name.split_whitespace().next()?;
+    let elem = ELEMENTS.into_iter().find(|elem| elem.name() == word)?;
+    let cell = Cell { offset: 0, elem, storage: Storage::Plain };
+    cell.patch(var, value).err().map(|e| e.to_string())
+}
+
+/// Carries out what [`check_all`] has found good; `known` is what it said.
+pub fn write(
+    ctx: &mut Context,
+    line: &mut JobLine,
+    plc: &str,
+    list: &[Assignment],
+    known: bool,
+    as_json: bool,
+) -> anyhow::Result<()> {
+    // One alone is a command of the engine, which also reaches variables of the program.
+    let builder = if list.len() > 1 || !known { message(&ctx.stack, plc, list)? } else { None };
+    let whole = builder.is_some();
+    if let Some(builder) = builder {
+        send(ctx, plc, &builder)?;
+    } else {
+        let mut written: Vec<&str> = Vec::new();
+        for (var, value) in list {
+            let job = json!({ "do": "write", "var": var, "value": value });
+            line.ask(&job, LIMIT).map_err(|e| match written.as_slice() {
+                [] => anyhow::anyhow!("{e}"),
+                some => anyhow::anyhow!("{e}; written before that: {}", some.join(", ")),
+            })?;
+            written.push(var);
+        }
+    }
+    if as_json {
+        let written: Vec<Value> =
+            list.iter().map(|(var, value)| json!({ "var": var, "value": value })).collect();
+        println(&json!({ "written": written, "one_scan": whole || list.len() == 1 }).to_string());
+    } else {
+        for (var, value) in list {
+            println(&format!("{var} = {}", super::plc::plain(value)));
+        }
+    }
+    if list.len() > 1 && !whole {
+        let outside: Vec<&str> = list
+            .iter()
+            .filter(|(var, _)| place(&ctx.stack, plc, var).is_none())
+            .map(|(var, _)| var.as_str())
+            .collect();
+        eprintln!(
+            "dinrail: written one after the other, not in one scan: one message carries places in %Q and %M only, not {}",
+            outside.join(", ")
+        );
+    }
+    Ok(())
+}
+
+/// Bits of the image that are set: where, which, to what.
+struct Change {
+    area: Area,
+    offset: u32,
+    mask: Vec<u8>,
+    value: Vec<u8>,
+}
+
+impl Change {
+    fn is_whole(&self) -> bool {
+        self.mask.iter().all(|mask| *mask == 0xFF)
+    }
+
+    fn push(&self, builder: &mut Builder) -> Result<(), WriteError> {
+        let (area, offset) = (self.area, self.offset);
+        if self.is_whole() {
+            return builder.push(&Op::Set { area, offset, bytes: &self.value });
+        }
+        let and: Vec<u8> = self.mask.iter().map(|mask| !mask).collect();
+        let or: Vec<u8> = self.mask.iter().zip(&self.value).map(|(mask, value)| mask & value).collect();
+        builder.push(&Op::Mask { area, offset, and: &and, or: &or })
+    }
+}
+
+/// All assignments as one message; `None`: something lies outside %Q and %M. Places in a row become one operation.
+fn message(stack: &Stack, plc: &str, list: &[Assignment]) -> anyhow::Result<Option<Builder>> {
+    let mut changes: Vec<Change> = Vec::new();
+    for (var, value) in list {
+        let Some((area, cell)) = place(stack, plc, var) else { return Ok(None) };
+        let Patch { offset, len, mask, value } = cell.patch(var, value)?;
+        let len = usize::from(len).min(8);
+        let next = Change { area, offset, mask: mask[..len].to_vec(), value: value[..len].to_vec() };
+        match changes.last_mut() {
+            Some(last)
+                if last.is_whole()
+                    && next.is_whole()
+                    && last.area == area
+                    && last.offset + last.value.len() as u32 == offset =>
+            {
+                last.mask.extend(next.mask);
+                last.value.extend(next.value);
+            }
+            _ => changes.push(next),
+        }
+    }
+    let mut builder = Builder::default();
+    for change in &changes {
+        change.push(&mut builder).map_err(|_| {
+            UsageError(format!(
+                "nothing was written: {} assignments do not fit one message (at most {MAX_OPS} places that are not in a row, and {MAX_BYTES} bytes with 12 for each), which is what one scan applies whole; write them with several commands",
+                list.len()
+            ))
+        })?;
+    }
+    Ok(Some(builder))
+}
+
+/// Where in %Q or %M a %-address lies, or a symbol that the stack file gives to a place there.
+fn place(stack: &Stack, plc: &str, var: &str) -> Option<(Area, Cell)> {
+    let var = var.trim();
+    if var.starts_with('%') {
+        return address(var, addressing_of(stack.service(plc)));
+    }
+    let of_plc = |wired: &Option<String>| wired.as_deref().is_none_or(|wired| wired == plc);
+    let services = stack.services.iter().filter(|s| of_plc(&s.wiring.plc));
+    let range = services
+        .flat_map(|s| &s.wiring.outputs)
+        .find(|r| r.symbol.as_deref().is_some_and(|symbol| symbol.eq_ignore_ascii_case(var)))?;
+    if range.area == Area::Input {
+        return None;
+    }
+    let elem = ELEMENTS.into_iter().find(|elem| range.type_name.as_deref() == Some(elem.name()))?;
+    // A TIME at %QD has another form than one elsewhere: that is left to the engine.
+    if elem == ElemType::Time || elem.bytes() != range.bytes {
+        return None;
+    }
+    let storage = range.bit.map_or(Storage::Plain, Storage::Bit);
+    Some((range.area, Cell { offset: range.byte, elem, storage }))
+}
+
+fn address(text: &str, addressing: Addressing) -> Option<(Area, Cell)> {
+    let at = parse_address(text, addressing).ok()?;
+    let area = match at.area {
+        AreaKind::Output => Area::Output,
+        AreaKind::Marker => Area::Marker,
+        AreaKind::Input | AreaKind::Retain | AreaKind::Data => return None,
+    };
+    // The types that the engine gives to places without a variable.
+    let elem = match at.size {
+        AddressSize::Bit => ElemType::Bool,
+        AddressSize::Byte => ElemType::Usint,
+        AddressSize::Word => ElemType::Uint,
+        AddressSize::Dword => ElemType::Udint,
+        AddressSize::Lword => ElemType::Ulint,
+    };
+    let storage = at.bit.map_or(Storage::Plain, Storage::Bit);
+    Some((area, Cell { offset: at.byte, elem, storage }))
+}
+
+/// Sends the message and waits until the engine has acknowledged it.
+fn send(ctx: &mut Context, plc: &str, builder: &Builder) -> anyhow::Result<()> {
+    let mut image: Subscriber<Image> = ctx.subscriber(&TopicKind::Image.of(plc))?;
+    let mut writes: Publisher<ImageWrite> = ctx.publisher(&TopicKind::Writes.of(plc))?;
+    let header = ImageWrite { ops: builder.ops(), ..ImageWrite::default() };
+    let seq = writes.send_tail(header, builder.tail())?;
+    writes.ring();
+    let (writer, generation, begin) = (ctx.writer, ctx.generation, Instant::now());
+    let mut result = None;
+    while begin.elapsed() < LIMIT {
+        image.newest(|header, _| {
+            let ours = |a: &ipc_types::payload::AckEntry| {
+                (a.writer, a.generation) == (writer, generation) && a.seq >= seq
+            };
+            result = acks(header).find(ours).map(|a| a.result);
+        });
+        if let Some(result) = result {
+            return verdict(plc, result);
+        }
+        std::thread::sleep(LOOK);
+    }
+    anyhow::bail!(
+        "plc '{plc}' has not acknowledged the write within {} s; see `dinrail ps`. It may still be applied within a second",
+        LIMIT.as_secs()
+    )
+}
+
+fn verdict(plc: &str, result: u32) -> anyhow::Result<()> {
+    let why = match result {
+        write_result::APPLIED => return Ok(()),
+        write_result::TOO_OLD => "it waited for longer than a second; write it again",
+        write_result::OLD_GENERATION => "it is of an older generation; write it again",
+        write_result::MALFORMED => "the message is malformed; is the engine of another version?",
+        write_result::OUTSIDE => {
+            "a place lies outside of %Q or %M; see input_bytes, output_bytes and marker_bytes"
+        }
+        _ => "for a reason that this version does not know",
+    };
+    anyhow::bail!("plc '{plc}' has not applied the write: {why}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ipc_types::image_write::parse;
+    use ipc_types::stack::ServiceEntry;
+    use ipc_types::wiring::{ImageRange, OnBad, Wiring};
+
+    /// A stack whose service `io` sends %QB1 as `Lamps` and %QX2.3 as `Pump`.
+    fn stack() -> Stack {
+        let range = |byte, bit, type_name: &str, symbol: &str| ImageRange {
+            area: Area::Output,
+            byte,
+            bit,
+            bytes: 1,
+            type_name: Some(type_name.to_owned()),
+            symbol: Some(symbol.to_owned()),
+            label: String::new(),
+            key: String::new(),
+            on_bad: OnBad::default(),
+            status_byte: None,
+        };
+        let wiring = Wiring {
+            plc: Some("plc".to_owned()),
+            outputs: vec![range(1, None, "USINT", "Lamps"), range(2, Some(3), "BOOL", "Pump")],
+            ..Wiring::default()
+        };
+        let (name, kind) = ("io".to_owned(), "can-io".to_owned());
+        Stack {
+            name: "s".to_owned(),
+            file: "s.toml".into(),
+            dir: ".".into(),
+            text: String::new(),
+            build_id: String::new(),
+            root: "/".into(),
+            prefix: String::new(),
+            services: vec![ServiceEntry { name, kind, index: 1, config: Value::Null, wiring }],
+            topics: Vec::new(),
+        }
+    }
+
+    fn built(list: &[(&str, Value)]) -> anyhow::Result<Option<String>> {
+        let list: Vec<Assignment> =
+            list.iter().map(|(var, value)| ((*var).to_owned(), value.clone())).collect();
+        let Some(builder) = message(&stack(), "plc", &list)? else { return Ok(None) };
+        Ok(Some(parse(builder.tail()).unwrap().map(|op| format!("{op:?}")).collect::<Vec<_>>().join("\n")))
+    }
+
+    #[test]
+    fn places_of_the_image_go_in_one_message() {
+        let list = [
+            ("%MW1", json!(0x1234)),
+            ("%QX0.3", json!(true)),
+            ("%mx2.0", json!(false)),
+            ("%MD4", json!("16#FF")),
+        ];
+        insta::assert_snapshot!(built(&list).unwrap().unwrap(), @r#"
+Set { area: Marker, offset: 2, bytes: [52, 18] }
+Mask { area: Output, offset: 0, and: [247], or: [8] }
+Mask { area: Marker, offset: 2, and: [254], or: [0] }
+Set { area: Marker, offset: 16, bytes: [255, 0, 0, 0] }
+"#);
+        insta::assert_snapshot!(built(&[("lamps", json!(7)), ("Pump", json!(true))]).unwrap().unwrap(), @r#"
+Set { area: Output, offset: 1, bytes: [7] }
+Mask { area: Output, offset: 2, and: [247], or: [8] }
+"#);
+        assert!(place(&stack(), "other", "Lamps").is_none());
+        // Inputs and variables of the program lie elsewhere.
+        assert_eq!(built(&[("%MW0", json!(1)), ("Main.Speed", json!(1))]).unwrap(), None);
+        assert_eq!(built(&[("%MW0", json!(1)), ("%IW0", json!(1))]).unwrap(), None);
+    }
+
+    #[test]
+    fn what_does_not_fit_one_message_is_not_written() {
+        let vars: Vec<String> = (0..=MAX_OPS).map(|i| format!("%MW{}", 2 * i)).collect();
+        let list: Vec<(&str, Value)> = vars.iter().map(|var| (var.as_str(), json!(1))).collect();
+        assert!(built(&list[..MAX_OPS]).unwrap().is_some());
+        let error = built(&list).unwrap_err();
+        assert!(
+            error.is::<UsageError>() && error.to_string().starts_with("nothing was written: 17 assign"),
+            "{error}"
+        );
+        // In a row they are one operation, up to the bytes of a message.
+        let row =
+            |count: usize| (0..count).map(|i| (format!("%MW{i}"), json!(i))).collect::<Vec<Assignment>>();
+        let ops = |count| message(&stack(), "plc", &row(count)).map(|builder| builder.unwrap().ops());
+        assert_eq!(ops(17).unwrap(), 1);
+        assert_eq!(ops(250).unwrap(), 1);
+        assert!(ops(251).is_err());
+    }
+
+    #[test]
+    fn values_are_compared_with_the_types_before_anything_is_written() {
+        let of = |type_name: &str| json!({ "value": 0, "type": type_name });
+        for (value, type_name) in [
+            (json!(1), "INT"),
+            (json!(true), "BOOL"),
+            (json!("16#FFFF"), "WORD"),
+            (json!("T#5s"), "TIME (ms)"),
+            (json!(1.5), "REAL"),
+            (json!("anything"), "A_TYPE_OF_LATER"),
+        ] {
+            assert_eq!(misfit("x", &value, &of(type_name)), None, "{type_name}");
+        }
+        let said: Vec<String> = [
+            (json!("bad"), "INT"),
+            (json!(70000), "UINT"),
+            (json!(2), "BOOL"),
+            (json!("soon"), "TIME (ms)"),
+            (json!(1), "ARRAY OF INT"),
+        ]
+        .iter()
+        .filter_map(|(value, type_name)| misfit("x", value, &of(type_name)))
+        .collect();
+        insta::assert_snapshot!(said.join("\n"), @r#"
+'x' is INT; "bad" does not fit: give a whole number in its range
+'x' is UINT; 70000 does not fit: give a whole number in its range
+'x' is BOOL; 2 does not fit: give true or false
+'x' is TIME; "soon" does not fit: give milliseconds or a text like "1.5s"
+'x' is an array: write its elements, like x[1]
+"#);
+    }
+
+    #[test]
+    fn refusals_of_the_engine_are_told() {
+        assert!(verdict("plc", write_result::APPLIED).is_ok());
+        for result in [1, 2, 3, 4, 99] {
+            let said = verdict("plc", result).unwrap_err().to_string();
+            assert!(said.starts_with("plc 'plc' has not applied the write: "), "{said}");
+        }
+    }
+}

@@ -1,0 +1,119 @@
+//! A line with its transport and its requests.
+
+use super::super::config::Config;
+use super::super::image::{InputTable, read_request};
+use super::super::line::{Failure, Line, Settings, SlotKind};
+use super::super::link::{Link, Reports};
+use super::super::plan::{Batch, LinePlan, Target};
+use super::super::port::{SEND_LIMIT_NS, SerialPort};
+use super::{KIND, RunError};
+use ipc_types::Context;
+use ipc_types::topic::TopicKind;
+
+pub(super) enum Transport {
+    Serial(Box<SerialPort>),
+    Tcp(Link),
+}
+
+/// What a slot of a line is for.
+#[derive(Clone, Copy)]
+pub(super) enum Use {
+    Batch(usize),
+    Write,
+}
+
+pub(super) struct Runner {
+    pub(super) plan: LinePlan,
+    pub(super) line: Line,
+    pub(super) transport: Transport,
+    pub(super) uses: Vec<Use>,
+    /// Slot of each batch.
+    pub(super) batch_slots: Vec<usize>,
+    /// Units that were dead when last looked at.
+    pub(super) dead: Vec<u8>,
+    /// Why the link does not work; `None`: it does, or was not needed.
+    pub(super) trouble: Option<String>,
+    pub(super) connected: bool,
+}
+
+pub(super) fn runner(
+    ctx: &mut Context,
+    config: &Config,
+    i: usize,
+    plan: LinePlan,
+    reports: &Reports,
+) -> Result<Runner, RunError> {
+    let turnaround_ns = config.turnaround.ns();
+    let (settings, transport) = match &plan.target {
+        Target::Serial { service, ascii } => {
+            let rx = ctx.subscriber(&TopicKind::SerialRx.of(service))?;
+            let tx = ctx.publisher(&TopicKind::SerialTx.of(service))?;
+            let port = SerialPort::new(tx, rx, *ascii, ctx.writer, ctx.generation);
+            let settings =
+                Settings { serial: true, turnaround_ns: Some(turnaround_ns), send_limit_ns: SEND_LIMIT_NS };
+            (settings, Transport::Serial(Box::new(port)))
+        }
+        target => {
+            let broadcasts = matches!(target, Target::RtuOverTcp(_));
+            let settings = Settings {
+                serial: false,
+                turnaround_ns: broadcasts.then_some(turnaround_ns),
+                send_limit_ns: config.connect_timeout.ns() + 1_000_000_000,
+            };
+            let link = Link::start(i, target, config.connect_timeout.duration(), reports.clone());
+            let Some(link) = link else {
+                let message = "it is no connection".to_owned();
+                return Err(RunError::Config { kind: KIND, key: "tcp".to_owned(), message });
+            };
+            (settings, Transport::Tcp(link))
+        }
+    };
+    let mut line = Line::new(settings, config.unit_settings());
+    for unit in &plan.units {
+        line.set_unit(unit.unit, unit.settings);
+    }
+    let (mut uses, mut batch_slots) = (Vec::new(), Vec::new());
+    for (b, batch) in plan.batches.iter().enumerate() {
+        let pdu = read_request(batch.table, batch.at, batch.count);
+        let slot = line.add_slot(batch.unit, SlotKind::Read, &pdu, Some(batch.period_ns));
+        if !batch.enabled {
+            line.enable(slot, false, 0);
+        }
+        batch_slots.push(slot);
+        uses.push(Use::Batch(b));
+    }
+    Ok(Runner { plan, line, transport, uses, batch_slots, dead: Vec::new(), trouble: None, connected: false })
+}
+
+/// Puts an answer into the inputs. True: the unit does not like the ranges in one request.
+pub(super) fn batch_done(
+    batch: &Batch,
+    result: Result<&[u8], Failure>,
+    inputs: &mut InputTable,
+    now_ns: u64,
+) -> bool {
+    let data = match result {
+        Ok(&[code, 2 | 3]) if code & 0x80 != 0 && !batch.alone.is_empty() => return true,
+        Ok(&[code, _, ref data @ ..]) if code & 0x80 == 0 => Some(data),
+        _ => None,
+    };
+    for &(read, skip) in &batch.members {
+        let taken = data.is_some_and(|data| inputs.data(read, data, skip, now_ns));
+        if !taken {
+            inputs.failed(read);
+        }
+    }
+    false
+}
+
+pub(super) fn set_write(runners: &mut [Runner], slots: &[(usize, usize)], i: usize, pdu: &[u8], now_ns: u64) {
+    if let Some(&(line, slot)) = slots.get(i) {
+        runners[line].line.set_write(slot, pdu, now_ns);
+    }
+}
+
+pub(super) fn drop_write(runners: &mut [Runner], slots: &[(usize, usize)], i: usize) {
+    if let Some(&(line, slot)) = slots.get(i) {
+        runners[line].line.drop_write(slot);
+    }
+}
