@@ -4,6 +4,8 @@
 //! tests may use this module: its functions panic.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may end like this")]
 
+pub mod allocations;
+
 use crate::rail::{self, Held, Svc};
 use crate::stack::{ServiceEntry, Stack, TopicEntry, Wake};
 use crate::topic::{EVENTS, TopicKind};

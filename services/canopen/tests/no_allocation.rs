@@ -1,36 +1,10 @@
 //! The exchange of PDOs allocates nothing once it is made: counted by a global allocator.
-#![allow(unsafe_code)]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 use dinrail_canopen::master::exchange::{Exchange, Field, Plan, RxPdo, TxPdo};
 use dinrail_canopen::protocol::io::Outbox;
 use ipc_types::payload::CanFrame;
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
-thread_local! {
-    static COUNT: Cell<u64> = const { Cell::new(0) };
-}
-
-struct Counting;
-
-// SAFETY: hands everything to the system's allocator; the counter is a plain thread-local cell.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        let _ = COUNT.try_with(|c| c.set(c.get() + 1));
-        // SAFETY: the caller's promises are passed on.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
-        // SAFETY: as above.
-        unsafe { System.dealloc(at, layout) }
-    }
-    unsafe fn realloc(&self, at: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        let _ = COUNT.try_with(|c| c.set(c.get() + 1));
-        // SAFETY: as above.
-        unsafe { System.realloc(at, layout, size) }
-    }
-}
+use ipc_types::testing::allocations::{Counting, allocations};
 
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
@@ -72,24 +46,25 @@ fn queues_samples_and_outputs_allocate_nothing() {
     let mut exchange = Exchange::new(plan, 1000);
     let mut out = Outbox::default();
     exchange.set_operational(5, true, 0);
-    let before = COUNT.with(Cell::get);
-    for t_ns in 1..2000u64 {
-        for id in [0x185, 0x185, 0x285, 0x385] {
-            exchange.on_frame(t_ns, &CanFrame::classic(id, &(t_ns as u16).to_le_bytes()));
+    let allocated = allocations(|| {
+        for t_ns in 1..2000u64 {
+            for id in [0x185, 0x185, 0x285, 0x385] {
+                exchange.on_frame(t_ns, &CanFrame::classic(id, &(t_ns as u16).to_le_bytes()));
+            }
+            if t_ns.is_multiple_of(10) {
+                exchange.on_sync(t_ns);
+                exchange.sync_pdos(t_ns, &mut out);
+                exchange.set_outputs(&[t_ns as u8, 1]);
+            }
+            exchange.on_time(t_ns, &mut out);
+            if exchange.take_sample().is_some() {
+                exchange.published(t_ns);
+            }
+            exchange.on_scan(t_ns + 1);
+            assert!(out.drain().count() < 10);
         }
-        if t_ns.is_multiple_of(10) {
-            exchange.on_sync(t_ns);
-            exchange.sync_pdos(t_ns, &mut out);
-            exchange.set_outputs(&[t_ns as u8, 1]);
-        }
-        exchange.on_time(t_ns, &mut out);
-        if exchange.take_sample().is_some() {
-            exchange.published(t_ns);
-        }
-        exchange.on_scan(t_ns + 1);
-        assert!(out.drain().count() < 10);
-    }
-    assert_eq!(COUNT.with(Cell::get) - before, 0);
+    });
+    assert_eq!(allocated, 0);
     let queue = exchange.queues().next().unwrap();
     assert!(queue.dropped > 0 && queue.most == 16, "{queue:?}");
     assert!(exchange.samples() > 100);

@@ -1,5 +1,4 @@
 //! Nothing is allocated between a request and its answer, whatever the request is.
-#![allow(unsafe_code)]
 
 use dinrail_iec::Addressing;
 use dinrail_modbus::config::OnStop;
@@ -14,28 +13,8 @@ use dinrail_modbus::tcp::Backend;
 use dinrail_modbus::view::View;
 use ipc_types::image_write::Builder;
 use ipc_types::payload::{Image, PlcState, SerialChunk, serial_flag};
+use ipc_types::testing::allocations::{Counting, allocations};
 use ipc_types::wiring::AreaSizes;
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
-struct Counting;
-
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: every call is passed on to the system's allocator unchanged; the counter neither allocates nor panics.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        let _ = ALLOCATIONS.try_with(|n| n.set(n.get() + 1));
-        // SAFETY: the caller's promise is passed on.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promise is passed on.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
 
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
@@ -123,19 +102,20 @@ fn requests_allocate_nothing() {
     let peer = Peer::Ip(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST));
     let mut session = Session::default();
     let mut answers = 0;
-    let before = ALLOCATIONS.get();
-    for _ in 0..1000 {
-        session.space()[..stream.len()].copy_from_slice(&stream);
-        session.received(stream.len());
-        image.begin();
-        // Sixteen at a time.
-        for next in [Next::Again, Next::Read] {
-            assert_eq!(session.process(&mut device, &peer, &mut image), next);
-            answers += session.output().len();
-            session.sent(session.output().len());
+    let allocated = allocations(|| {
+        for _ in 0..1000 {
+            session.space()[..stream.len()].copy_from_slice(&stream);
+            session.received(stream.len());
+            image.begin();
+            // Sixteen at a time.
+            for next in [Next::Again, Next::Read] {
+                assert_eq!(session.process(&mut device, &peer, &mut image), next);
+                answers += session.output().len();
+                session.sent(session.output().len());
+            }
         }
-    }
-    assert_eq!(ALLOCATIONS.get() - before, 0);
+    });
+    assert_eq!(allocated, 0);
     assert!(answers > 1000 * 20 * 9);
     // Beyond the map, no file, no queue.
     assert_eq!((session.counts().requests, session.counts().exceptions), (20_000, 4_000));
@@ -147,18 +127,19 @@ fn requests_allocate_nothing() {
         let mut line = Line::new(mode, 0, device, 1, 1);
         let frames: Vec<Vec<u8>> = requests.iter().map(|pdu| serial_frame(mode, pdu)).collect();
         let (mut sent, mut seq) = (0, 0);
-        let before = ALLOCATIONS.get();
-        for frame in frames.iter().cycle().take(2000) {
-            seq += 1;
-            let mut chunk = SerialChunk { flags: serial_flag::END, ..SerialChunk::default() };
-            chunk.stamp.seq = seq;
-            image.begin();
-            line.chunk(&chunk, frame, &mut image, &mut |answer| {
-                sent += answer.len();
-                true
-            });
-        }
-        assert_eq!(ALLOCATIONS.get() - before, 0, "{mode:?}");
+        let allocated = allocations(|| {
+            for frame in frames.iter().cycle().take(2000) {
+                seq += 1;
+                let mut chunk = SerialChunk { flags: serial_flag::END, ..SerialChunk::default() };
+                chunk.stamp.seq = seq;
+                image.begin();
+                line.chunk(&chunk, frame, &mut image, &mut |answer| {
+                    sent += answer.len();
+                    true
+                });
+            }
+        });
+        assert_eq!(allocated, 0, "{mode:?}");
         assert!(sent > 2000 * 5, "{mode:?}");
     }
 }

@@ -1,5 +1,4 @@
 //! A scan allocates nothing: counted by a global allocator, over every kind of thing a scan can take.
-#![allow(unsafe_code)]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 use dinrail_iec::Source as SourceText;
@@ -9,34 +8,9 @@ use dinrail_plc::setup::{InputRange, Setup};
 use ipc_types::image_write::{Builder, Op};
 use ipc_types::payload::PlcState;
 use ipc_types::scan_record::{Command, Source, Start};
+use ipc_types::testing::allocations::{Counting, allocations};
 use ipc_types::wiring::{Area, OnBad};
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
 use std::sync::Arc;
-
-thread_local! {
-    static COUNT: Cell<u64> = const { Cell::new(0) };
-}
-
-struct Counting;
-
-// SAFETY: hands everything to the system's allocator; the counter is a plain thread-local cell.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        let _ = COUNT.try_with(|c| c.set(c.get() + 1));
-        // SAFETY: the caller's promises are passed on.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
-        // SAFETY: as above.
-        unsafe { System.dealloc(at, layout) }
-    }
-    unsafe fn realloc(&self, at: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        let _ = COUNT.try_with(|c| c.set(c.get() + 1));
-        // SAFETY: as above.
-        unsafe { System.realloc(at, layout, size) }
-    }
-}
 
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
@@ -88,9 +62,10 @@ fn a_scan_allocates_nothing() {
     scan(1, Some(Command::Start(Start::Cold)));
     scan(2, Some(Command::Force { patch: force, path: "main.x" }));
     scan(3, None);
-    let before = COUNT.with(Cell::get);
-    for n in 4..1000 {
-        assert_eq!(scan(n, None), PlcState::Run);
-    }
-    assert_eq!(COUNT.with(Cell::get) - before, 0, "allocations in 996 scans");
+    let allocated = allocations(|| {
+        for n in 4..1000 {
+            assert_eq!(scan(n, None), PlcState::Run);
+        }
+    });
+    assert_eq!(allocated, 0, "allocations in 996 scans");
 }

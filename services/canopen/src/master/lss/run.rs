@@ -27,7 +27,7 @@ pub enum LssError {
     /// A single service.
     #[error("{0}: no device in the state configuration answered")]
     Nobody(&'static str),
-    #[error("{what}: the device refused: {}", reason(*.what, *.code, *.specific))]
+    #[error("{what}: the device refused: {}", reason(.what, *.code, *.specific))]
     Refused { what: &'static str, code: u8, specific: u8 },
     #[error("devices answer, but none to its whole identity: frames are lost, or one is faulty")]
     Lost,
