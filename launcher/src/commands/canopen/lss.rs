@@ -22,7 +22,7 @@ const LIMIT: Duration = Duration::from_mins(10);
 /// Who speaks on the bus.
 enum Line {
     Master(Box<JobLine>),
-    Own(Bus, LssLine),
+    Own(Box<Bus>, Box<LssLine>),
 }
 
 /// The canopen-master of a bus, if it has one.
@@ -41,7 +41,7 @@ impl Line {
             Some(master) => Ok(Self::Master(Box::new(JobLine::open(&mut ctx, running, KIND, &master)?))),
             None => {
                 drop(ctx);
-                Ok(Self::Own(Bus::open(args)?, LssLine::default()))
+                Ok(Self::Own(Box::new(Bus::open(args)?), Box::default()))
             }
         }
     }

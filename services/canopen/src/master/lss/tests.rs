@@ -19,6 +19,8 @@ struct Bus {
     /// Frames so far, both ways; those for which this is true are lost.
     frames: usize,
     lose: fn(usize, &CanFrame) -> bool,
+    /// The devices lose what they were told when they go back to waiting.
+    forgets: bool,
 }
 
 impl Bus {
@@ -29,6 +31,7 @@ impl Bus {
             now: 0,
             frames: 0,
             lose: |_, _| false,
+            forgets: false,
         }
     }
 
@@ -58,6 +61,9 @@ impl Bus {
                 let mut answers = Outbox::default();
                 for slave in &mut self.slaves {
                     slave.on_frame(&frame, &mut answers);
+                    if self.forgets && frame.data[..2] == [0x04, 0] {
+                        *slave = LssSlave::new(address(9), UNCONFIGURED, LssAbilities::default());
+                    }
                 }
                 for answer in answers.drain().collect::<Vec<_>>() {
                     if self.arrives(&answer) {
@@ -125,18 +131,25 @@ fn a_failed_assign_tells_what_it_did_before() {
 }
 
 #[test]
-fn a_device_that_forgets_its_node_id_is_noticed() {
-    // The node-id never arrives, its answer is made up by a second device with the same identity.
-    let twins = [1, 1].map(|serial| LssSlave::new(address(serial), UNCONFIGURED, LssAbilities::default()));
-    let mut bus = Bus::new(twins);
-    // The second twin hears no command that would configure it: it is found again.
-    bus.slaves[1] = LssSlave::new(address(1), UNCONFIGURED, LssAbilities::default());
+fn twins_are_one_device_to_the_master() {
+    let mut bus = Bus::unconfigured([1, 1]);
     let value = bus.call(json!({ "call": "assign", "from": 5 })).unwrap();
-    // Both hear the same: they are one to the master, and both have the node-id.
     assert_eq!(found(&value), [(1, 5)]);
+    assert!(bus.slaves.iter().all(|s| s.pending_node_id() == 5));
+}
+
+#[test]
+fn a_device_that_forgets_its_node_id_is_noticed() {
     let mut bus = Bus::unconfigured([9]);
-    // The switch back to waiting and the node-id are acknowledged by nobody but the wire: the command is lost.
-    bus.slaves.push(LssSlave::new(address(9), 4, LssAbilities::default()));
+    bus.forgets = true;
+    let error = bus.call(json!({ "call": "assign", "from": 5 })).unwrap_err();
+    assert_eq!(error, LssError::Again { address: address(9), node_id: 5 });
+    assert!(bus.all_wait());
+}
+
+#[test]
+fn a_command_that_never_arrives_is_told_and_the_device_waits_again() {
+    let mut bus = Bus::unconfigured([9]);
     bus.lose = |_, frame| frame.can_id == 0x7E5 && frame.data[0] == 0x11;
     assert_eq!(
         bus.call(json!({ "call": "assign", "from": 5 })),
