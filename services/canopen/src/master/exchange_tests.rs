@@ -409,10 +409,10 @@ proptest! {
                     sent += 1;
                     exchange.on_frame(now_ns, &CanFrame::classic(0x185, &[sent]));
                 }
-                2 => if exchange.take_sample().is_some() {
+                2 if exchange.take_sample().is_some() => {
                     inputs = Some(exchange.tail()[0]);
                     exchange.published(now_ns);
-                },
+                }
                 3 => {
                     seen.extend(inputs);
                     images.push(now_ns);

@@ -75,7 +75,9 @@ impl Bed {
         let fleet = Fleet::new(Simulation::Cia401, NODES).map_err(|e| e.to_string())?;
         let mut bed = Self { network, fleet, now_ns: 0 };
         let mut out = Outbox::default();
-        NODES.into_iter().for_each(|id| bed.fleet.power_on(0, id, &mut out));
+        for id in NODES {
+            bed.fleet.power_on(0, id, &mut out);
+        }
         bed.network.start(0, &mut out);
         bed.pass(&mut out);
         Ok(bed)
