@@ -7,15 +7,21 @@
 use std::io;
 use std::os::fd::{FromRawFd, OwnedFd, RawFd};
 
-/// Puts this process under SCHED_FIFO; threads that it starts later inherit it. Priority 1 to 99.
+/// Puts the calling thread under SCHED_FIFO; threads and processes that it starts later inherit it. Priority 1 to 99.
 pub fn set_fifo(priority: u32) -> io::Result<()> {
     let param = libc::sched_param { sched_priority: priority as i32 };
-    // SAFETY: 0 names the calling process; the pointer is to a live local that the kernel only reads.
+    // SAFETY: 0 names the calling thread; the pointer is to a live local that the kernel only reads.
     if unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const param) } == 0 {
         Ok(())
     } else {
         Err(io::Error::last_os_error())
     }
+}
+
+/// Whether this user may use [`set_fifo`]. Asked on a thread that ends: the calling thread, and what it starts later,
+/// stay as they are.
+pub fn may_fifo(priority: u32) -> bool {
+    std::thread::spawn(move || set_fifo(priority).is_ok()).join().unwrap_or(false)
 }
 
 /// Takes over a descriptor that the parent process passed by number.

@@ -7,7 +7,7 @@ use super::super::stack::BenchStack;
 use super::super::stats::{Samples, Sorted};
 use super::super::{Bench, Goal};
 use super::observe;
-use crate::supervise::sys::set_fifo;
+use crate::supervise::sys::{may_fifo, set_fifo};
 use anyhow::{anyhow, ensure};
 use ipc_types::clock::mono_ns;
 use ipc_types::payload::CanFrame;
@@ -84,7 +84,7 @@ fn run(bench: &mut Bench, priority: Option<u32>, limit_us: f64) -> anyhow::Resul
         }
         Err(e) => bench.note(format!("no timer loop beside the SYNC of {scheduler}: {e}")),
     }
-    if priority.is_some() && set_fifo(PRIORITY).is_err() {
+    if priority.is_some() && !may_fifo(PRIORITY) {
         bench.note("this user may not use SCHED_FIFO: the services ran without it");
     }
     Ok(())
