@@ -445,12 +445,13 @@ fn several_writes_are_one_or_none() {
     for (var, value) in [("%MW0", 1), ("%MB2", 8), ("%MW2", 255), ("%QB0", 5)] {
         assert_eq!(read(var), format!("{var} = {value}"));
     }
-    let many: Vec<String> = (0..17).map(|i| format!("%MW{}=7", 2 * i)).collect();
+    let many: Vec<String> = (0..65).map(|i| format!("%MW{}=7", 2 * i)).collect();
     let args: Vec<&str> = ["plc", "write"].into_iter().chain(many.iter().map(String::as_str)).collect();
     let output = stack.cli(&args);
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(
-        output.status.code() == Some(2) && said.contains("17 assignments do not fit one message"),
+        output.status.code() == Some(2)
+            && said.contains("65 assignments are more than one scan applies whole"),
         "{said}"
     );
     assert_eq!(read("%MW0"), "%MW0 = 1");
@@ -588,6 +589,34 @@ fn same(got: &[Value], expected: &[Value], what: &str) {
         let apart = (a[0].as_i64().unwrap() - b[0].as_i64().unwrap()).abs();
         assert!(apart <= 1 && a[1..] == b[1..], "{what}, frame {i}: {got} instead of {expected}");
     }
+}
+
+/// A killed tool cannot give its place back: the next one does, and does not wait for the launcher to find it.
+#[test]
+fn killed_senders_do_not_keep_others_out() {
+    let mut stack = Stack::up("cankilled", STACK, &[]);
+    let mut senders: Vec<Child> = (0..4)
+        .map(|_| {
+            dinrail()
+                .args(["can", "gen", "can0", "--gap", "10ms", "--stack", &stack.name])
+                .stdout(Stdio::null())
+                .stderr(Stdio::null())
+                .spawn()
+                .unwrap()
+        })
+        .collect();
+    // With all places taken the next one is told so.
+    stack.wait("a full house", || {
+        let output = stack.cli(&["can", "send", "can0", "123#01"]);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        (output.status.code() == Some(1) && said.contains("too many tools")).then_some(())
+    });
+    for sender in &mut senders {
+        sender.kill().unwrap();
+        sender.wait().unwrap();
+    }
+    stack.ok(&["can", "gen", "can0", "--id", "105", "--count", "3"]);
+    assert_eq!(stack.take_down(), 0);
 }
 
 #[test]

@@ -249,10 +249,10 @@ fn our_master_drives_devices_made_of_python_canopen() {
     assert_eq!(stack.take_down(), 0, "{}", stack.log());
 }
 
-/// Every transmission type both ways, spread over three devices: what the master is asked to set, and the way the values
+/// Every transmission type both ways, spread over four devices: what the master is asked to set, and the way the values
 /// of 6200h and 6411h go and come back.
-const KINDS: [(u8, [u8; 2], [u8; 2]); 3] =
-    [(14, [253, 252], [254, 0]), (15, [254, 3], [1, 5]), (16, [0, 255], [255, 240])];
+const KINDS: [(u8, [u8; 2], [u8; 2]); 4] =
+    [(14, [253, 252], [254, 0]), (15, [254, 3], [1, 5]), (16, [0, 255], [255, 240]), (17, [1, 255], [1, 0])];
 
 #[test]
 fn every_kind_of_pdo_with_devices_made_of_python_canopen() {
@@ -289,7 +289,7 @@ map = [
     let mut stack = Stack::spawn("copykinds", &our_master(&ports, &nodes), &[("io401.eds", EDS)]);
     stack.wait("the bus at work", || stack.is_ready("can0").then_some(()));
     let devices: Vec<Peer> = KINDS.iter().map(|(id, ..)| python_slave(&ports, &stack, *id)).collect();
-    for state in 30..33 {
+    for state in 30..34 {
         becomes(&stack, &format!("%IB{state}"), 5);
     }
     exchanges(&stack, &pairs);

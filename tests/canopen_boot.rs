@@ -160,10 +160,15 @@ fn a_configuration_with_the_right_date_is_not_loaded_again() {
         stack.ok(&["canopen", "boot", "2"]);
         wait_said_times(&stack, "io", "node 2 (Simulated I/O) is booted", times);
     };
+    let loaded = |had: &str| {
+        let text = "node 2 (Simulated I/O) is booted; its configuration was loaded: ";
+        wait_said(&stack, "io", &format!("{text}{had}, 100 and 200 are expected"));
+    };
     let write = |what: &str, value: &str| stack.ok(&["canopen", "sdo", "write", "2", what, value]);
     let save = || stack.ok(&["canopen", "sdo", "write", "2", "1010:01", "0x65766173"]);
     // A new device has no date: it was loaded.
     is("2001", "42");
+    loaded("it was never configured, or was changed since (date and time are 0 in 1020h)");
     is("1020:01", "100");
     is("1020:02", "200");
     // The device keeps its configuration, date and all. A value that the download would change stays.
@@ -171,17 +176,20 @@ fn a_configuration_with_the_right_date_is_not_loaded_again() {
     write("2001", "7");
     boot(2);
     is("2001", "7");
+    assert_eq!(said(&stack, "io").matches("its configuration was loaded").count(), 1);
     // Another time, or another date: loaded.
     write("1020:02", "201");
     save();
     write("2001", "8");
     boot(3);
+    loaded("it had date 100 and time 201 (1020h)");
     is("2001", "42");
     is("1020:02", "200");
     write("1020:01", "99");
     save();
     write("2001", "9");
     boot(4);
+    loaded("it had date 99 and time 200 (1020h)");
     is("2001", "42");
     assert_eq!(stack.take_down(), 0);
 }
@@ -377,6 +385,33 @@ fn a_new_master_keeps_alive_what_it_is_told_to() {
     assert_eq!((watch.boot_ups(2), watch.boot_ups(3)), (1, 2), "{:?}", watch.frames());
     drop(watch);
     assert_eq!(nodes.take_down(), 0);
+}
+
+/// What is sent to a driver that is not there is lost: the reset of all nodes, the boot-up message of a device.
+#[test]
+fn master_and_devices_begin_when_the_driver_of_the_bus_is_there() {
+    let bus = format!("{BUS}{HELD}\n");
+    let node2 = expected_node(2, "mandatory = true");
+    let toml = [bus.as_str(), &slave("n2", 2, ""), MASTER, &node2].concat();
+    let mut stack = Stack::up("latedriver", &toml, &[("io401.eds", IO401)]);
+    wait_operational(&stack, &[2]);
+    stack.kill("can0", Signal::KILL);
+    stack.wait("no driver", || (stack.service("can0")?["state"] == "held").then_some(()));
+    for service in ["n2", "io"] {
+        stack.ok(&["restart", service]);
+        wait_said(&stack, service, "bus 'can0' has no driver yet: nothing is sent until it is there");
+    }
+    let before = said(&stack, "io");
+    stack.ok(&["restart", "can0"]);
+    for service in ["n2", "io"] {
+        wait_said(&stack, service, "the driver of bus 'can0' is there, after ");
+    }
+    wait_operational(&stack, &[2]);
+    // Nothing was lost: the first try goes well.
+    assert_eq!(status(&stack).unwrap()["frames_dropped"], 0);
+    let after = said(&stack, "io").split_off(before.len());
+    assert!(after.contains("node 2 (Simulated I/O) is booted") && !after.contains("failed"), "{after}");
+    assert_eq!(stack.take_down(), 0);
 }
 
 #[test]

@@ -379,6 +379,36 @@ fn the_launcher_is_killed_no_orphan_lives_and_the_next_up_runs() {
 }
 
 #[test]
+fn a_machine_that_stood_still_is_nobodys_hang() {
+    let (port, can_port) = (free_port(), free_port());
+    let scratch = Scratch::new("frozen");
+    scratch.write("main.st", PROGRAM);
+    scratch.write("conveyor.log", include_str!("../recordings/conveyor.log"));
+    let mut stack = Stack::spawn_in("frozen", &text(port, can_port, ""), scratch, &[]);
+    stack.wait_ready();
+    works(&stack, port);
+    let before = generations(&stack);
+    let launcher = rustix::process::Pid::from_child(&stack.launcher);
+    let pids: Vec<_> = SERVICES.iter().filter_map(|s| rustix::process::Pid::from_raw(stack.pid(s))).collect();
+    let all = |signal| {
+        for pid in &pids {
+            rustix::process::kill_process(*pid, signal).unwrap();
+        }
+    };
+    // As a frozen control group or a paused virtual machine does: longer than any heartbeat may fail to come.
+    all(Signal::STOP);
+    rustix::process::kill_process(launcher, Signal::STOP).unwrap();
+    sleep(Duration::from_secs(4));
+    // The launcher is the first to run again.
+    rustix::process::kill_process(launcher, Signal::CONT).unwrap();
+    sleep(Duration::from_millis(300));
+    all(Signal::CONT);
+    works(&stack, port);
+    assert_eq!(generations(&stack), before, "{}", stack.log());
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
 fn a_stopped_reader_on_the_command_line_disturbs_nobody() {
     let (port, can_port) = (free_port(), free_port());
     let scratch = Scratch::new("reader");

@@ -76,12 +76,16 @@ VAR
   Average AT %MD2 : REAL;
   Edge : R_TRIG;
   Late : TON;
+  Low : INT;
+  High : INT;
+  Torn : INT;
 END_VAR
   Edge(CLK := Barrier);
   IF Edge.Q THEN Parcels := Parcels + 1; END_IF;
   Average := Average * 0.99 + UINT_TO_REAL(Speed) * 0.01 + SIN(Average) * 0.001;
   Late(IN := Speed > Limit, PT := T#50ms);
   Over := Late.Q;
+  IF Low <> High THEN Torn := Torn + 1; END_IF;
 END_PROGRAM
 ";
 
@@ -127,12 +131,20 @@ fn a_loss_free_recording_verifies_exactly() {
 #[test]
 fn forces_starts_and_stops_verify_too() {
     let stack = run("forces", 0.5, |stack, _| {
-        stack.ok(&["plc", "force", "Speed=1999"]);
+        stack.ok(&["plc", "force", "Speed=1999", "Barrier=TRUE"]);
         sleep(Duration::from_millis(200));
+        // Variables of the program are written in one scan, or none of them.
+        for value in ["1", "2", "3"] {
+            let both = [format!("Low={value}"), format!("main.High={value}"), "%MW0=7".to_owned()];
+            let said = stack.ok(&["plc", "write", "--json", &both[0], &both[1], &both[2]]);
+            assert!(said.contains("\"one_scan\":true"), "{said}");
+        }
+        assert!(!stack.cli(&["plc", "write", "Low=4", "High=nine"]).status.success());
+        assert_eq!(stack.ok(&["plc", "read", "Low", "High", "Torn"]), "Low = 3\nHigh = 3\nTorn = 0\n");
         stack.ok(&["plc", "stop"]);
         sleep(Duration::from_millis(100));
         stack.ok(&["plc", "run"]);
-        stack.ok(&["plc", "unforce", "Speed"]);
+        stack.ok(&["plc", "unforce", "Speed", "Barrier"]);
         stack.ok(&["plc", "warm"]);
         sleep(Duration::from_millis(200));
         stack.ok(&["plc", "cold"]);

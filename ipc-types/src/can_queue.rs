@@ -25,21 +25,12 @@ pub struct CanQueue {
     waiting: VecDeque<CanFrame>,
     limit: usize,
     dropped: u64,
-    driver_until_ns: u64,
 }
 
 impl CanQueue {
     /// At most `limit` frames wait; those that come then are dropped and counted.
     pub fn new(limit: usize) -> Self {
-        Self { waiting: VecDeque::with_capacity(limit), limit, dropped: 0, driver_until_ns: 0 }
-    }
-
-    /// Until this time the first frames wait for a driver that was never there yet: it starts at the same time, and the
-    /// first words of a node on the bus must not be lost.
-    #[must_use]
-    pub fn until_driver(mut self, t_ns: u64) -> Self {
-        self.driver_until_ns = t_ns;
-        self
+        Self { waiting: VecDeque::with_capacity(limit), limit, dropped: 0 }
     }
 
     /// Puts frames behind those that wait.
@@ -57,12 +48,11 @@ impl CanQueue {
     /// a missing driver costs the frame it is about; the others wait for the next call.
     pub fn send(
         &mut self,
-        now_ns: u64,
         tx: &mut Publisher<CanFrame>,
         sent: impl FnMut(&CanFrame),
     ) -> Result<Handed, SendError> {
         let before = tx.next_seq();
-        let handed = self.hand(now_ns, |frame| tx.send(*frame).map(|_| ()), sent);
+        let handed = self.hand(|frame| tx.send(*frame).map(|_| ()), sent);
         if tx.next_seq() != before {
             tx.ring();
         }
@@ -71,7 +61,6 @@ impl CanQueue {
 
     fn hand(
         &mut self,
-        now_ns: u64,
         mut send: impl FnMut(&CanFrame) -> Result<(), SendError>,
         mut sent: impl FnMut(&CanFrame),
     ) -> Result<Handed, SendError> {
@@ -79,10 +68,8 @@ impl CanQueue {
             match send(frame) {
                 Ok(()) => {
                     sent(frame);
-                    self.driver_until_ns = 0;
                     self.waiting.pop_front();
                 }
-                Err(SendError::NoReader(_)) if now_ns < self.driver_until_ns => break,
                 Err(SendError::NoReader(_)) => {
                     self.dropped += self.waiting.len() as u64;
                     self.waiting.clear();
@@ -135,7 +122,6 @@ mod tests {
     /// Hands over with a driver that takes `room` frames, then answers `then`.
     fn hand(
         queue: &mut CanQueue,
-        now_ns: u64,
         mut room: usize,
         then: fn() -> SendError,
     ) -> (Result<Handed, SendError>, Vec<u32>) {
@@ -144,19 +130,19 @@ mod tests {
             room = room.checked_sub(1).ok_or_else(then)?;
             Ok(())
         };
-        (queue.hand(now_ns, send, |frame| taken.push(frame.id())), taken)
+        (queue.hand(send, |frame| taken.push(frame.id())), taken)
     }
 
     #[test]
     fn what_finds_no_room_waits_in_order() {
         let mut queue = CanQueue::new(4);
         queue.add(frames(1..4));
-        assert_eq!(hand(&mut queue, 0, 2, full), (Ok(Handed::On), vec![1, 2]));
+        assert_eq!(hand(&mut queue, 2, full), (Ok(Handed::On), vec![1, 2]));
         assert_eq!((queue.len(), queue.next_deadline(7)), (1, Some(7 + RETRY_NS)));
         // Behind the one that waits; what is above the limit is dropped and counted.
         queue.add(frames(4..9));
         assert_eq!((queue.len(), queue.dropped()), (4, 2));
-        assert_eq!(hand(&mut queue, 0, 9, full), (Ok(Handed::On), vec![3, 4, 5, 6]));
+        assert_eq!(hand(&mut queue, 9, full), (Ok(Handed::On), vec![3, 4, 5, 6]));
         assert!(queue.is_empty());
         assert_eq!(queue.next_deadline(7), None);
     }
@@ -165,23 +151,10 @@ mod tests {
     fn without_a_driver_frames_are_dropped() {
         let mut queue = CanQueue::new(4);
         queue.add(frames(1..3));
-        assert_eq!(hand(&mut queue, 0, 0, no_reader), (Ok(Handed::Dropped), vec![]));
+        assert_eq!(hand(&mut queue, 0, no_reader), (Ok(Handed::Dropped), vec![]));
         assert_eq!((queue.len(), queue.dropped()), (0, 2));
         // Nothing to hand over: nobody notices that the driver is away.
-        assert_eq!(hand(&mut queue, 0, 0, no_reader), (Ok(Handed::On), vec![]));
-    }
-
-    #[test]
-    fn the_first_frames_wait_for_a_driver_that_starts() {
-        let mut queue = CanQueue::new(4).until_driver(100);
-        queue.add(frames(1..3));
-        assert_eq!(hand(&mut queue, 99, 0, no_reader), (Ok(Handed::On), vec![]));
-        assert_eq!(hand(&mut queue, 99, 1, full), (Ok(Handed::On), vec![1]));
-        // It was there: now it is away.
-        assert_eq!(hand(&mut queue, 99, 0, no_reader), (Ok(Handed::Dropped), vec![]));
-        let mut late = CanQueue::new(4).until_driver(100);
-        late.add(frames(1..2));
-        assert_eq!(hand(&mut late, 100, 0, no_reader).0, Ok(Handed::Dropped));
+        assert_eq!(hand(&mut queue, 0, no_reader), (Ok(Handed::On), vec![]));
     }
 
     #[test]
@@ -189,8 +162,8 @@ mod tests {
         let broken = || SendError::Middleware { topic: "can0/tx".to_owned(), cause: "x".to_owned() };
         let mut queue = CanQueue::new(4);
         queue.add(frames(1..4));
-        assert_eq!(hand(&mut queue, 0, 1, broken), (Err(broken()), vec![1]));
-        assert_eq!(hand(&mut queue, 0, 9, broken), (Ok(Handed::On), vec![3]));
+        assert_eq!(hand(&mut queue, 1, broken), (Err(broken()), vec![1]));
+        assert_eq!(hand(&mut queue, 9, broken), (Ok(Handed::On), vec![3]));
         assert_eq!(queue.dropped(), 1);
     }
 }

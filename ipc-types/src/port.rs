@@ -11,6 +11,7 @@ use iceoryx2::port::publisher::Publisher as IoxPublisher;
 use iceoryx2::port::subscriber::Subscriber as IoxSubscriber;
 use iceoryx2::port::{BackpressureAction, SendError as IoxSendError};
 use iceoryx2::prelude::AllocationStrategy;
+use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use std::rc::Rc;
 
@@ -46,6 +47,7 @@ fn open<H: Payload>(node: &Node<Svc>, topic: &TopicEntry) -> Result<Factory<H>, 
 /// A writer of a topic.
 pub struct Publisher<H: Payload> {
     port: IoxPublisher<Svc, [u8], H>,
+    factory: Factory<H>,
     /// Rung by [`Publisher::ring`].
     bells: Vec<(Rc<Bell>, u32)>,
     name: String,
@@ -79,6 +81,7 @@ impl<H: Payload> Publisher<H> {
             .map_err(|e| RailError::middleware(format!("publisher on '{}'", topic.name), e))?;
         Ok(Self {
             port,
+            factory,
             bells,
             name: topic.name.clone(),
             max_tail: topic.max_tail,
@@ -143,6 +146,11 @@ impl<H: Payload> Publisher<H> {
     fn failed(&mut self, cause: String) -> SendError {
         self.refused += 1;
         SendError::Middleware { topic: self.name.clone(), cause }
+    }
+
+    /// Whether anybody has connected to read. A reader that was killed counts until it is cleaned up after.
+    pub fn has_reader(&self) -> bool {
+        self.factory.dynamic_config().number_of_subscribers() > 0
     }
 
     /// Wakes the consumers of the topic. Once a batch is enough.

@@ -34,6 +34,8 @@ class Device(can.Listener):
         self.net.subscribe(0, self.commanded)
         self.net.subscribe(0x80, self.synchronised)
         self.node.add_write_callback(self.written)
+        # Before its boot-up message: the master may be faster than the next line here.
+        say("ready")
         self.reset()
 
     def reset(self):
@@ -152,7 +154,6 @@ class Device(can.Listener):
 def main():
     bus, eds, node_id, serial = sys.argv[1:5]
     device = Device(bus, eds, int(node_id), int(serial))
-    say("ready")
     for line in sys.stdin:
         device.told(line.strip())
     threading.Event().wait()

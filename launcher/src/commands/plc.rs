@@ -1,6 +1,6 @@
 //! `dinrail plc`: jobs for a PLC of a running stack.
 
-use super::plc_write::{check_all, write};
+use super::plc_write::{check_all, force, write};
 use super::{UsageError, println};
 use crate::cli::PlcCommand;
 use crate::supervise::client::{find, observe};
@@ -18,7 +18,7 @@ pub fn run(
     command: PlcCommand,
     json: bool,
 ) -> anyhow::Result<()> {
-    let mut jobs = jobs_of(&command)?;
+    let mut jobs = jobs_of(&command);
     let assignments = match &command {
         PlcCommand::Write { assignments } | PlcCommand::Force { assignments } => {
             assignments.iter().map(|text| assignment(text)).collect::<Result<Vec<_>, _>>()?
@@ -39,6 +39,7 @@ pub fn run(
         if is_write {
             return write(&mut ctx, &mut line, &plc, &assignments, known, json);
         }
+        return force(&mut line, &assignments, json);
     }
     for job in jobs {
         let answer = line.ask(&job, LIMIT)?;
@@ -52,15 +53,11 @@ pub fn run(
 }
 
 /// The jobs of a command, in order.
-fn jobs_of(command: &PlcCommand) -> Result<Vec<Value>, UsageError> {
+fn jobs_of(command: &PlcCommand) -> Vec<Value> {
     let plain = |what: &str| vec![json!({ "do": what })];
-    let assign = |what: &str, list: &[String]| -> Result<Vec<Value>, UsageError> {
-        let job = |(var, value)| json!({ "do": what, "var": var, "value": value });
-        list.iter().map(|text| assignment(text).map(job)).collect()
-    };
     let each =
         |what: &str, list: &[String]| list.iter().map(|var| json!({ "do": what, "var": var })).collect();
-    Ok(match command {
+    match command {
         PlcCommand::Status => plain("status"),
         PlcCommand::Stop => plain("stop"),
         PlcCommand::Run => plain("run"),
@@ -72,13 +69,12 @@ fn jobs_of(command: &PlcCommand) -> Result<Vec<Value>, UsageError> {
             let path = std::path::absolute(program).unwrap_or_else(|_| program.clone());
             vec![json!({ "do": "load", "path": path, "cold": cold })]
         }
-        PlcCommand::Force { assignments } => assign("force", assignments)?,
-        // Not as jobs: see `plc_write`.
-        PlcCommand::Write { .. } => Vec::new(),
+        // See `plc_write`.
+        PlcCommand::Write { .. } | PlcCommand::Force { .. } => Vec::new(),
         PlcCommand::Unforce { all: true, .. } => plain("unforce_all"),
         PlcCommand::Unforce { variables, .. } => each("unforce", variables),
         PlcCommand::Read { variables } => each("read", variables),
-    })
+    }
 }
 
 /// A program of the stack's own folder is named as the stack file names it: so it is found in the recording.
@@ -118,10 +114,7 @@ fn text_of(job: &Value, answer: &Value) -> String {
         (Some(var), Value::Object(map)) if map.contains_key("value") => {
             format!("{var} = {}", plain(&map["value"]))
         }
-        (Some(var), Value::Null | Value::Bool(_)) => match job.get("value") {
-            Some(value) => format!("{var} = {}", plain(value)),
-            None => format!("{var}: done"),
-        },
+        (Some(var), Value::Null | Value::Bool(_)) => format!("{var}: done"),
         (Some(var), value) if !value.is_object() => format!("{var} = {}", plain(value)),
         (_, Value::Object(map)) => {
             map.iter().map(|(key, value)| format!("{key}: {}", plain(value))).collect::<Vec<_>>().join("\n")
@@ -167,8 +160,8 @@ mod tests {
         let job = json!({ "do": "read", "var": "x" });
         assert_eq!(text_of(&job, &json!({ "value": true, "type": "BOOL" })), "x = TRUE");
         assert_eq!(text_of(&json!({ "do": "stop" }), &json!(true)), "done");
-        let job = json!({ "do": "force", "var": "x", "value": 3 });
-        assert_eq!(text_of(&job, &Value::Null), "x = 3");
+        let job = json!({ "do": "unforce", "var": "x" });
+        assert_eq!(text_of(&job, &Value::Bool(true)), "x: done");
         assert_eq!(
             text_of(&json!({ "do": "status" }), &json!({ "state": "run", "scans": 7 })),
             "scans: 7\nstate: run"

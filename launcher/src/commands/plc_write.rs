@@ -1,7 +1,8 @@
-//! `dinrail plc write` and `plc force`: every assignment is resolved and checked before the first is carried out.
+//! `dinrail plc write` and `plc force`: every assignment is resolved and checked before the first is carried out, and
+//! all are applied in one scan.
 //!
-//! Several places in %Q and %M go to the engine as one message, applied whole in one scan. Variables of the program lie
-//! outside the image that such a message can name: with one of them among several, each is written by itself.
+//! They go to the engine as one job. Where it cannot take them, because it knows no symbols of the stack file without a
+//! program or because they are too many, places in %Q and %M go as one message of image writes.
 
 use super::{UsageError, println};
 use crate::supervise::jobs::{JobError, JobLine};
@@ -10,6 +11,7 @@ use dinrail_iec::{AddressSize, Addressing, parse_address};
 use dinrail_modbus::service::addressing_of;
 use dinrail_plc::engine::value::Cell;
 use dinrail_plc::engine::write_result;
+use dinrail_plc::service::MAX_SET;
 use ipc_types::Context;
 use ipc_types::image_write::{Builder, MAX_BYTES, MAX_OPS, Op, WriteError};
 use ipc_types::payload::{Image, ImageWrite, acks};
@@ -92,6 +94,12 @@ fn misfit(var: &str, value: &Value, answer: &Value) -> Option<String> {
     cell.patch(var, value).err().map(|e| e.to_string())
 }
 
+/// How assignments reach the engine whole.
+enum Way {
+    Job(Value),
+    Message(Box<Builder>),
+}
+
 /// Carries out what [`check_all`] has found good; `known` is what it said.
 pub fn write(
     ctx: &mut Context,
@@ -101,43 +109,75 @@ pub fn write(
     known: bool,
     as_json: bool,
 ) -> anyhow::Result<()> {
-    // One alone is a command of the engine, which also reaches variables of the program.
-    let builder = if list.len() > 1 || !known { message(&ctx.stack, plc, list)? } else { None };
-    let whole = builder.is_some();
-    if let Some(builder) = builder {
-        send(ctx, plc, &builder)?;
-    } else {
-        let mut written: Vec<&str> = Vec::new();
-        for (var, value) in list {
-            let job = json!({ "do": "write", "var": var, "value": value });
-            line.ask(&job, LIMIT).map_err(|e| match written.as_slice() {
-                [] => anyhow::anyhow!("{e}"),
-                some => anyhow::anyhow!("{e}; written before that: {}", some.join(", ")),
-            })?;
-            written.push(var);
-        }
+    match way(&ctx.stack, plc, list, known)? {
+        Way::Job(job) => ask(line, &job, list, "written")?,
+        Way::Message(builder) => send(ctx, plc, &builder)?,
     }
+    tell("written", list, as_json);
+    Ok(())
+}
+
+/// As [`write`], for `plc force`.
+pub fn force(line: &mut JobLine, list: &[Assignment], as_json: bool) -> anyhow::Result<()> {
+    let job = set_job("force", list).ok_or_else(|| too_many("forced", list.len()))?;
+    ask(line, &job, list, "forced")?;
+    tell("forced", list, as_json);
+    Ok(())
+}
+
+fn ask(line: &mut JobLine, job: &Value, list: &[Assignment], what: &str) -> anyhow::Result<()> {
+    match line.ask(job, LIMIT) {
+        Ok(_) => Ok(()),
+        Err(refused @ JobError::Refused { .. }) if list.len() > 1 => {
+            anyhow::bail!("nothing was {what}: {refused}")
+        }
+        Err(e) => Err(e.into()),
+    }
+}
+
+fn tell(what: &str, list: &[Assignment], as_json: bool) {
     if as_json {
-        let written: Vec<Value> =
+        let done: Vec<Value> =
             list.iter().map(|(var, value)| json!({ "var": var, "value": value })).collect();
-        println(&json!({ "written": written, "one_scan": whole || list.len() == 1 }).to_string());
+        println(&json!({ what: done, "one_scan": true }).to_string());
     } else {
         for (var, value) in list {
             println(&format!("{var} = {}", super::plc::plain(value)));
         }
     }
-    if list.len() > 1 && !whole {
-        let outside: Vec<&str> = list
-            .iter()
-            .filter(|(var, _)| place(&ctx.stack, plc, var).is_none())
-            .map(|(var, _)| var.as_str())
-            .collect();
-        eprintln!(
-            "dinrail: written one after the other, not in one scan: one message carries places in %Q and %M only, not {}",
-            outside.join(", ")
-        );
+}
+
+fn way(stack: &Stack, plc: &str, list: &[Assignment], known: bool) -> anyhow::Result<Way> {
+    let job = set_job("write", list);
+    match job {
+        Some(job) if known => Ok(Way::Job(job)),
+        job => match (message(stack, plc, list)?, job) {
+            (Some(builder), _) => Ok(Way::Message(Box::new(builder))),
+            (None, Some(job)) => Ok(Way::Job(job)),
+            (None, None) => Err(too_many("written", list.len()).into()),
+        },
     }
-    Ok(())
+}
+
+/// All assignments as one job, unless they are more than one takes.
+fn set_job(what: &str, list: &[Assignment]) -> Option<Value> {
+    let set: Vec<Value> = list.iter().map(|(var, value)| json!({ "var": var, "value": value })).collect();
+    let job = json!({ "do": what, "set": set });
+    let fits = job.to_string().len() <= TopicKind::Jobs.row().max_tail as usize;
+    (list.len() <= MAX_SET && fits).then_some(job)
+}
+
+fn too_many(what: &str, count: usize) -> UsageError {
+    let places = if what == "written" {
+        format!(
+            "; of places in %Q and %M also {MAX_OPS}, those in a row counting as one, in {MAX_BYTES} bytes with 12 for each"
+        )
+    } else {
+        String::new()
+    };
+    UsageError(format!(
+        "nothing was {what}: {count} assignments are more than one scan applies whole (at most {MAX_SET}, in 4096 bytes of JSON{places}); use several commands"
+    ))
 }
 
 /// Bits of the image that are set: where, which, to what.
@@ -187,12 +227,7 @@ fn message(stack: &Stack, plc: &str, list: &[Assignment]) -> anyhow::Result<Opti
     }
     let mut builder = Builder::default();
     for change in &changes {
-        change.push(&mut builder).map_err(|_| {
-            UsageError(format!(
-                "nothing was written: {} assignments do not fit one message (at most {MAX_OPS} places that are not in a row, and {MAX_BYTES} bytes with 12 for each), which is what one scan applies whole; write them with several commands",
-                list.len()
-            ))
-        })?;
+        change.push(&mut builder).map_err(|_| too_many("written", list.len()))?;
     }
     Ok(Some(builder))
 }
@@ -358,7 +393,8 @@ Mask { area: Output, offset: 2, and: [247], or: [8] }
         assert!(built(&list[..MAX_OPS]).unwrap().is_some());
         let error = built(&list).unwrap_err();
         assert!(
-            error.is::<UsageError>() && error.to_string().starts_with("nothing was written: 17 assign"),
+            error.is::<UsageError>()
+                && error.to_string().starts_with("nothing was written: 17 assignments are more"),
             "{error}"
         );
         // In a row they are one operation, up to the bytes of a message.
@@ -368,6 +404,33 @@ Mask { area: Output, offset: 2, and: [247], or: [8] }
         assert_eq!(ops(17).unwrap(), 1);
         assert_eq!(ops(250).unwrap(), 1);
         assert!(ops(251).is_err());
+    }
+
+    #[test]
+    fn variables_go_as_one_job_and_places_too_where_the_engine_knows_them() {
+        let of = |list: &[Assignment], known| {
+            way(&stack(), "plc", list, known).map(|way| match way {
+                Way::Job(job) => job["set"].as_array().unwrap().len(),
+                Way::Message(builder) => 1000 + builder.ops() as usize,
+            })
+        };
+        let list = |count: usize, name: &str| -> Vec<Assignment> {
+            (0..count).map(|i| (format!("{name}{}", 2 * i), json!(1))).collect()
+        };
+        assert_eq!(of(&list(3, "Main.v"), true).unwrap(), 3);
+        assert_eq!(of(&list(17, "%MW"), true).unwrap(), 17);
+        assert_eq!(of(&list(3, "%MW"), false).unwrap(), 1003, "with a symbol that the engine does not know");
+        let row: Vec<Assignment> = (0..250).map(|i| (format!("%MW{i}"), json!(i))).collect();
+        assert_eq!(of(&row, true).unwrap(), 1001, "too many for a job");
+        assert_eq!(of(&list(MAX_SET, "Main.v"), true).unwrap(), MAX_SET);
+        for list in [list(MAX_SET + 1, "Main.v"), list(60, &"long".repeat(20)), list(MAX_SET + 1, "%MW")] {
+            let error = of(&list, true).unwrap_err();
+            assert!(
+                error.is::<UsageError>() && error.to_string().contains("(at most 64, in 4096"),
+                "{error}"
+            );
+            assert!(set_job("force", &list).is_none());
+        }
     }
 
     #[test]

@@ -19,6 +19,8 @@ use std::process::{Command, Stdio};
 
 /// Room for output of a child while the launcher is busy.
 const PIPE_BYTES: usize = 256 * 1024;
+/// Most bytes read of a child that has ended: what its pipe held. A process that it left may go on writing.
+const REST_BYTES: usize = 2 * PIPE_BYTES;
 
 /// The launcher's executable, held since its start: an upgrade on disk never mixes versions.
 #[derive(Debug)]
@@ -112,6 +114,17 @@ fn set_inheritable(fds: &[BorrowedFd<'_>], inheritable: bool) -> io::Result<()> 
     Ok(())
 }
 
+/// What a reading of a child's output left behind.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Left {
+    /// There may be more.
+    More,
+    /// Nothing for now.
+    Nothing,
+    /// Nothing any more.
+    End,
+}
+
 /// A child process.
 #[derive(Debug)]
 pub struct Child {
@@ -125,12 +138,28 @@ impl Child {
         let (output, theirs) = rustix::pipe::pipe_with(rustix::pipe::PipeFlags::CLOEXEC)?;
         let _ = rustix::pipe::fcntl_setpipe_size(&output, PIPE_BYTES);
         rustix::fs::fcntl_setfl(&output, OFlags::NONBLOCK)?;
-        let child = command.stdout(Stdio::from(theirs.try_clone()?)).stderr(Stdio::from(theirs)).spawn()?;
+        let mut child =
+            command.stdout(Stdio::from(theirs.try_clone()?)).stderr(Stdio::from(theirs)).spawn()?;
         let pid = child.id();
-        let raw = Pid::from_raw(pid as i32).ok_or_else(|| io::Error::other("pid 0"))?;
         // Not reaped yet, so the number still means this process.
-        let pidfd = rustix::process::pidfd_open(raw, PidfdFlags::empty())?;
-        Ok(Self { pid, pidfd, output })
+        let watched = Pid::from_raw(pid as i32)
+            .ok_or_else(|| io::Error::other("pid 0"))
+            .and_then(|raw| Ok(rustix::process::pidfd_open(raw, PidfdFlags::empty())?));
+        match watched {
+            Ok(pidfd) => Ok(Self { pid, pidfd, output }),
+            Err(e) => {
+                // Nobody could watch it: a second one would soon run beside it.
+                let _ = child.kill();
+                let _ = child.wait();
+                Err(e)
+            }
+        }
+    }
+
+    /// Ends a process that cannot be watched, for good.
+    pub fn end(self) {
+        self.signal(Kill::Now);
+        let _ = rustix::process::waitid(WaitId::PidFd(self.pidfd.as_fd()), WaitIdOptions::EXITED);
     }
 
     /// Readable when the process has ended.
@@ -165,19 +194,33 @@ impl Child {
         }))
     }
 
-    /// Reads what it printed, without waiting; `false` at the end of the pipe.
-    pub fn read(&self, buffer: &mut [u8], mut take: impl FnMut(&[u8])) -> bool {
+    /// Reads what it printed, without waiting.
+    pub fn read(&self, buffer: &mut [u8], mut take: impl FnMut(&[u8])) -> Left {
         // Bounded a turn, so that a chatty service cannot keep the launcher from its neighbours.
         for _ in 0..8 {
             match rustix::io::read(&self.output, &mut *buffer) {
-                Ok(0) => return false,
+                Ok(0) => return Left::End,
                 Ok(n) => take(&buffer[..n]),
                 Err(rustix::io::Errno::INTR) => {}
-                Err(rustix::io::Errno::AGAIN) => return true,
-                Err(_) => return false,
+                Err(rustix::io::Errno::AGAIN) => return Left::Nothing,
+                Err(_) => return Left::End,
             }
         }
-        true
+        Left::More
+    }
+
+    /// Reads all that it printed before its end: its last lines say why.
+    pub fn read_rest(&self, buffer: &mut [u8], mut take: impl FnMut(&[u8])) {
+        let mut taken = 0;
+        while taken < REST_BYTES {
+            let left = self.read(buffer, |bytes| {
+                taken += bytes.len();
+                take(bytes);
+            });
+            if left != Left::More {
+                return;
+            }
+        }
     }
 }
 
@@ -293,13 +336,36 @@ mod tests {
         let child = sh("echo out; echo err >&2; exit 3");
         assert_eq!(wait(&child), Exit::Code(3));
         let mut text = Vec::new();
-        assert!(!child.read(&mut [0; 64], |bytes| text.extend_from_slice(bytes)), "end of the pipe");
+        // A process that another test just starts may hold the pipe until it executes its program.
+        while child.read(&mut [0; 64], |bytes| text.extend_from_slice(bytes)) != Left::End {
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
         assert_eq!(text, b"out\nerr\n");
         assert_eq!(wait(&sh("kill -9 $$")), Exit::Signal { number: 9, core: false });
         let child = sh("read line; sleep 60");
         assert_eq!(child.reap().unwrap(), None);
         child.signal(Kill::Now);
         assert_eq!(wait(&child).to_string(), "killed by SIGKILL");
+    }
+
+    #[test]
+    fn the_last_words_of_one_that_printed_much_are_read() {
+        let child = sh(
+            "i=0; while [ $i -lt 2000 ]; do echo $i'0123456789012345678901234567890123456789012345678901234567890123456789'; i=$((i+1)); done; echo last; exit 1",
+        );
+        assert_eq!(wait(&child), Exit::Code(1));
+        let mut text = Vec::new();
+        child.read_rest(&mut [0; 8192], |bytes| text.extend_from_slice(bytes));
+        assert!(text.len() > 8 * 8192 && text.ends_with(b"\nlast\n"), "{} bytes", text.len());
+    }
+
+    #[test]
+    fn one_that_cannot_be_watched_is_gone_at_once() {
+        let child = sh("trap '' TERM; sleep 60");
+        let proc = PathBuf::from(format!("/proc/{}", child.pid));
+        assert!(proc.exists());
+        child.end();
+        assert!(!proc.exists(), "neither running nor a zombie");
     }
 
     #[test]

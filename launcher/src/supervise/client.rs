@@ -51,14 +51,19 @@ fn choose(mut running: Vec<RunningStack>, name: Option<&str>) -> Result<RunningS
 /// How long a clean-up of what dead tools left may take.
 const CLEAN_LIMIT: Duration = Duration::from_secs(2);
 
-/// Joins the rail of a running stack as a tool. Once a process. Tools that were killed keep their place until somebody
-/// cleans up after them: when there is none left, that is done first.
+/// Joins the rail of a running stack as a tool. Once a process.
 pub fn observe(stack: &RunningStack) -> Result<Context, RailError> {
-    match Context::observer(&stack.root) {
-        Err(e) if is_full(&e) => clean_up(&stack.root),
+    with_room(&stack.root, || Context::observer(&stack.root))
+}
+
+/// Takes a place on the rail. Tools that were killed keep theirs until somebody cleans up after them: when there is none
+/// left, that is done, and it is tried again.
+pub fn with_room<T>(root: &Path, mut take: impl FnMut() -> Result<T, RailError>) -> Result<T, RailError> {
+    match take() {
+        Err(e) if is_full(&e) => clean_up(root),
         result => return result,
     }
-    Context::observer(&stack.root)
+    take()
 }
 
 /// Whether a topic has no place left for one more tool.

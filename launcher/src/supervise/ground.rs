@@ -83,16 +83,17 @@ fn end_leftovers(root: &Path) -> Result<(), GroundError> {
     let root = root.as_os_str().as_encoded_bytes();
     for entry in std::fs::read_dir("/proc").into_iter().flatten().flatten() {
         let Some(pid) = entry.file_name().to_str().and_then(|n| n.parse::<i32>().ok()) else { continue };
-        let Ok(line) = std::fs::read(entry.path().join("cmdline")) else { continue };
-        let words: Vec<&[u8]> = line.split(|b| *b == 0).collect();
-        if words.get(1) != Some(&b"__service".as_slice()) || !words.contains(&root) {
-            continue;
-        }
+        // Before the look: who has the number then is whom the descriptor means.
         let Some(pidfd) =
             Pid::from_raw(pid).and_then(|p| rustix::process::pidfd_open(p, PidfdFlags::empty()).ok())
         else {
             continue;
         };
+        let Ok(line) = std::fs::read(entry.path().join("cmdline")) else { continue };
+        let words: Vec<&[u8]> = line.split(|b| *b == 0).collect();
+        if words.get(1) != Some(&b"__service".as_slice()) || !words.contains(&root) {
+            continue;
+        }
         let _ = rustix::process::pidfd_send_signal(&pidfd, Signal::KILL);
         let begin = Instant::now();
         while rustix::process::pidfd_send_signal(&pidfd, Signal::KILL).is_ok() && alive(pid) {

@@ -21,6 +21,8 @@ struct Listening {
     /// Its generation from which on it counts.
     from: u32,
     ready: bool,
+    /// It is down until somebody starts it again: nothing waits for it.
+    held: bool,
 }
 
 /// Events on their way to the rail.
@@ -37,19 +39,25 @@ impl Outbox {
     }
 
     fn with(recorders: impl Iterator<Item = (usize, String)>) -> Self {
-        let recorders =
-            recorders.map(|(service, name)| Listening { service, name, from: 1, ready: false }).collect();
+        let recorders = recorders
+            .map(|(service, name)| Listening { service, name, from: 1, ready: false, held: false })
+            .collect();
         Self { recorders, waiting: VecDeque::new() }
     }
 
     /// Takes an event; [`Self::due`] says when it may go.
     pub fn take(&mut self, body: EventBody) {
-        if body.event == EventKind::Died
-            && let Some(recorder) = self.recorders.iter_mut().find(|r| r.name == body.service)
-        {
-            let generation = body.detail.get("generation").and_then(Value::as_u64).unwrap_or(0);
-            recorder.from = generation as u32 + 1;
-            recorder.ready = false;
+        if let Some(recorder) = self.recorders.iter_mut().find(|r| r.name == body.service) {
+            match body.event {
+                EventKind::Died => {
+                    let generation = body.detail.get("generation").and_then(Value::as_u64).unwrap_or(0);
+                    recorder.from = generation as u32 + 1;
+                    recorder.ready = false;
+                }
+                EventKind::Held => recorder.held = true,
+                EventKind::Started => recorder.held = false,
+                _ => {}
+            }
         }
         self.waiting.push_back(body);
     }
@@ -62,7 +70,7 @@ impl Outbox {
                 recorder.ready |= beat.generation >= recorder.from;
             }
         }
-        if self.recorders.iter().all(|r| r.ready) {
+        if self.recorders.iter().all(|r| r.ready || r.held) {
             return self.rest();
         }
         let too_long =
@@ -123,6 +131,21 @@ mod tests {
         }
         assert_eq!(kinds(&outbox.due(&[], 5)), [EventKind::Ready]);
         assert_eq!(outbox.rest().len(), WAITING_MAX);
+    }
+
+    #[test]
+    fn a_recorder_that_is_held_delays_nobody() {
+        let mut outbox = Outbox::with([(0, "rec".to_owned())].into_iter());
+        assert!(outbox.due(&[beat(0, 1, HealthState::Ready)], 0).is_empty());
+        outbox.take(event("rec", EventKind::Died, 1, 0));
+        outbox.take(event("rec", EventKind::Held, 1, 0));
+        assert_eq!(kinds(&outbox.due(&[], 0)), [EventKind::Died, EventKind::Held]);
+        outbox.take(event("plc", EventKind::Died, 1, 0));
+        assert_eq!(kinds(&outbox.due(&[], 0)), [EventKind::Died]);
+        // Started by hand, it is waited for again.
+        outbox.take(event("rec", EventKind::Started, 2, 0));
+        assert!(outbox.due(&[], 0).is_empty());
+        assert_eq!(kinds(&outbox.due(&[beat(0, 2, HealthState::Ready)], 0)), [EventKind::Started]);
     }
 
     #[test]

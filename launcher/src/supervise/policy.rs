@@ -25,6 +25,12 @@ use std::collections::VecDeque;
 pub const ABORT_GRACE_NS: u64 = 500_000_000;
 /// So many clean-ups of dead nodes may fail in a row before the stack fails.
 pub const CLEAN_ATTEMPTS: u32 = 3;
+/// Pause before a clean-up that failed is tried again: what hindered it (no process to be had, no memory) lasts longer
+/// than three attempts in a row.
+pub const CLEAN_PAUSE_NS: u64 = 250_000_000;
+/// Heartbeats are read every 20 ms. What passes beyond this between two readings is time in which the machine stood
+/// still (frozen, stopped, paused as a virtual machine), or the reader: it counts as nobody's silence.
+pub const READ_PAUSE_NS: u64 = 100_000_000;
 /// Pause between two clean-ups while /dev/shm is full.
 const NO_ROOM_PAUSE_NS: u64 = 500_000_000;
 /// How long the other services wait for the recorders at the start of a stack. A recorder is ready after some
@@ -43,9 +49,11 @@ pub struct Policy {
     clean_again: bool,
     clean_round: u64,
     clean_failures: u32,
-    /// When a clean-up that found no room is tried again.
+    /// When a clean-up that failed or found no room is tried again.
     clean_retry_at: Option<u64>,
     no_room: bool,
+    /// When heartbeats were read last.
+    read_at: Option<u64>,
     term_grace_ns: u64,
     out: Vec<Action>,
 }
@@ -62,7 +70,7 @@ impl Policy {
                 generation: 0,
                 since: 0,
                 ready_at: 0,
-                last_sign: 0,
+                silent_from: 0,
                 recent: VecDeque::new(),
                 row: 0,
             })
@@ -80,6 +88,7 @@ impl Policy {
             clean_failures: 0,
             clean_retry_at: None,
             no_room: false,
+            read_at: None,
             term_grace_ns,
             out: Vec::new(),
         }
@@ -135,7 +144,7 @@ impl Policy {
         slot.phase = Phase::Starting;
         slot.since = now;
         slot.ready_at = 0;
-        slot.last_sign = now;
+        slot.silent_from = now;
         let generation = slot.generation;
         self.out.push(Action::Spawn { service, generation });
     }
@@ -169,8 +178,12 @@ impl Policy {
         if slot.generation != generation || !slot.phase.alive() {
             return;
         }
-        slot.last_sign = now;
-        if slot.phase == Phase::Starting && matches!(state, HealthState::Ready | HealthState::Degraded) {
+        let ready = matches!(state, HealthState::Ready | HealthState::Degraded);
+        // A start counts from its beginning until it is ready.
+        if slot.phase != Phase::Starting || ready {
+            slot.silent_from = now;
+        }
+        if slot.phase == Phase::Starting && ready {
             slot.phase = Phase::Running;
             slot.ready_at = now;
             let after_ms = now.saturating_sub(slot.since) / 1_000_000;
@@ -188,17 +201,20 @@ impl Policy {
     /// All heartbeats up to `now` were read: whoever is silent since too long hangs. The time is the reader's,
     /// so that a late reader kills nobody.
     pub fn heartbeats_read(&mut self, now: u64) {
+        let away = self.read_at.map_or(0, |at| now.saturating_sub(at).saturating_sub(READ_PAUSE_NS));
+        self.read_at = Some(now);
         if self.stopping {
             return;
         }
         for service in 0..self.slots.len() {
             let slot = &mut self.slots[service];
-            let (since, limit) = match slot.phase {
-                Phase::Starting => (slot.since, slot.rule.start_timeout_ns),
-                Phase::Running => (slot.last_sign, slot.rule.hang_timeout_ns),
+            let limit = match slot.phase {
+                Phase::Starting => slot.rule.start_timeout_ns,
+                Phase::Running => slot.rule.hang_timeout_ns,
                 _ => continue,
             };
-            let waited = now.saturating_sub(since);
+            slot.silent_from = slot.silent_from.saturating_add(away).min(now);
+            let waited = now.saturating_sub(slot.silent_from);
             if waited <= limit {
                 continue;
             }
@@ -320,7 +336,7 @@ impl Policy {
                 return;
             }
             self.repeat_round();
-            self.request_clean();
+            self.clean_retry_at = Some(now + CLEAN_PAUSE_NS);
             return;
         }
         self.clean_failures = 0;
@@ -469,7 +485,8 @@ impl Policy {
             Phase::Aborting { kill_at } | Phase::Restarting { kill_at } | Phase::Stopping { kill_at } => {
                 Some(kill_at)
             }
-            Phase::Waiting { until } => Some(until),
+            // At the end nothing is started any more: a deadline that nobody meets would wake for ever.
+            Phase::Waiting { until } if !self.stopping => Some(until),
             _ => None,
         };
         let retry = self.clean_retry_at.filter(|_| !self.stopping);

@@ -195,6 +195,52 @@ fn a_starting_service_may_be_silent_for_longer_and_old_generations_do_not_count(
 }
 
 #[test]
+fn time_in_which_nobody_read_heartbeats_is_nobodys_silence() {
+    let rule = Rule { hang_timeout_ns: S, start_timeout_ns: 3 * S, ..Rule::default() };
+    let mut p = running(vec![rule.clone(), rule]);
+    // One is just starting again.
+    p.died(1, death(), 500 * MS);
+    p.clean_done(Ok(()), 500 * MS);
+    p.take();
+    let mut now = 600 * MS;
+    let mut turns = |p: &mut Policy, ms: u64| {
+        for _ in 0..ms / 20 {
+            now += 20 * MS;
+            p.heartbeats_read(now);
+        }
+        done(p)
+    };
+    assert_eq!(turns(&mut p, 200), []);
+    // The whole machine stood still for a minute; the launcher runs again before its services do.
+    p.beat(0, 1, HealthState::Ready, 800 * MS);
+    p.heartbeats_read(60 * S);
+    assert_eq!(done(&mut p), []);
+    now = 60 * S;
+    let mut turns = |p: &mut Policy, ms: u64| {
+        for _ in 0..ms / 20 {
+            now += 20 * MS;
+            p.heartbeats_read(now);
+        }
+        done(p)
+    };
+    // Afterwards silence counts again: 0.1 s of the pause, then every turn.
+    assert_eq!(turns(&mut p, 800), []);
+    assert_eq!(turns(&mut p, 200), [Action::Signal { service: 0, signal: Kill::Abort }]);
+    assert_eq!(turns(&mut p, 1400), []);
+    assert_eq!(turns(&mut p, 600), [Action::Signal { service: 1, signal: Kill::Abort }]);
+}
+
+#[test]
+fn a_reader_that_is_always_late_still_finds_the_hang() {
+    let mut p = running(vec![Rule { hang_timeout_ns: S, ..Rule::default() }]);
+    let late = (1..40).find(|turn| {
+        p.heartbeats_read(turn * 300 * MS);
+        !done(&mut p).is_empty()
+    });
+    assert_eq!(late, Some(9));
+}
+
+#[test]
 fn one_clean_up_serves_all_who_died_before_it_began() {
     let mut p = running(vec![Rule::default(), Rule::default(), Rule::default()]);
     p.died(0, death(), S);
@@ -211,12 +257,17 @@ fn one_clean_up_serves_all_who_died_before_it_began() {
 fn three_failed_clean_ups_fail_the_stack() {
     let mut p = running(vec![Rule::default(), Rule::default()]);
     p.died(0, death(), S);
+    let mut now = S;
     for _ in 0..2 {
         assert_eq!(done(&mut p), [Action::Clean]);
-        p.clean_done(Err("no answer within 2 s".into()), S);
+        p.clean_done(Err("no answer within 2 s".into()), now);
+        // Not at once: three helpers that cannot be started in the same moment are one failure.
+        assert_eq!((done(&mut p), p.next_deadline()), (vec![], Some(now + CLEAN_PAUSE_NS)));
+        now += CLEAN_PAUSE_NS;
+        p.tick(now);
     }
     assert_eq!(done(&mut p), [Action::Clean]);
-    p.clean_done(Err("no answer within 2 s".into()), S);
+    p.clean_done(Err("no answer within 2 s".into()), now);
     assert_eq!(done(&mut p), [Action::Signal { service: 1, signal: Kill::Term }]);
     assert!(p.failed().is_some_and(|why| why.contains("3 times in a row (no answer within 2 s)")));
 }
@@ -226,8 +277,10 @@ fn a_failed_clean_up_is_forgotten_after_a_good_one() {
     let mut p = running(vec![Rule { max: 100, ..Rule::default() }]);
     for generation in 2..6 {
         p.died(0, death(), S);
-        p.clean_done(Err("x".into()), S);
-        p.clean_done(Err("x".into()), S);
+        for _ in 0..2 {
+            p.clean_done(Err("x".into()), S);
+            p.tick(S + CLEAN_PAUSE_NS);
+        }
         p.clean_done(Ok(()), S);
         if let Some(t) = p.next_deadline() {
             p.tick(t);
@@ -270,6 +323,20 @@ fn who_ignores_sigterm_at_the_end_is_killed_and_a_second_stop_kills_all() {
     p.died(0, death(), S);
     p.died(1, death(), S);
     assert_eq!(done(&mut p), [Action::Ended]);
+}
+
+#[test]
+fn a_back_off_wakes_nobody_while_others_stop() {
+    let mut p = running(vec![Rule::default(), Rule::default()]);
+    for generation in 2..4 {
+        p.died(0, death(), S);
+        p.clean_done(Ok(()), S);
+        p.beat(0, generation, HealthState::Ready, S);
+    }
+    let Phase::Waiting { until } = p.slots()[0].phase else { panic!("{:?}", p.slots()[0].phase) };
+    p.stop("asked", S);
+    p.tick(until);
+    assert_eq!(p.next_deadline(), Some(S + TERM_GRACE_NS), "the other one's SIGKILL");
 }
 
 #[test]

@@ -180,6 +180,8 @@ fn serve(
                 }
             }
         }
+        // Before the reading: were this thread stopped after it, nobody would have been silent for so long.
+        let t_ns = clock::mono_ns();
         for (service, pulse) in pulses.iter_mut().enumerate() {
             pulse.health.newest(|health, _| {
                 if health.stamp.writer == pulse.writer {
@@ -192,7 +194,7 @@ fn serve(
             out.send(Report::Trouble(trouble));
         }
         let observed = observer.look(false).map(Box::new);
-        out.send(Report::Turn { t_ns: clock::mono_ns(), beats: std::mem::take(&mut beats), observed });
+        out.send(Report::Turn { t_ns, beats: std::mem::take(&mut beats), observed });
     }
 }
 

@@ -11,7 +11,9 @@ use std::os::fd::{FromRawFd, OwnedFd, RawFd};
 pub fn set_fifo(priority: u32) -> io::Result<()> {
     let param = libc::sched_param { sched_priority: priority as i32 };
     // SAFETY: 0 names the calling thread; the pointer is to a live local that the kernel only reads.
-    if unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const param) } == 0 {
+    if unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK, &raw const param) }
+        == 0
+    {
         Ok(())
     } else {
         Err(io::Error::last_os_error())
@@ -88,6 +90,22 @@ mod tests {
     fn standard_streams_and_closed_numbers_are_refused() {
         for number in [-1, 0, 1, 2, 1_000_000] {
             assert!(take_inherited(number).is_err(), "{number}");
+        }
+    }
+
+    #[test]
+    fn helper_threads_are_not_under_fifo() {
+        // SAFETY: asks for a number of the calling thread.
+        let policy = || unsafe { libc::sched_getscheduler(0) };
+        let worker = std::thread::spawn(move || match set_fifo(1) {
+            Ok(()) => Some((policy(), std::thread::spawn(policy).join().unwrap())),
+            Err(e) => {
+                eprintln!("skipped: {e}");
+                None
+            }
+        });
+        if let Some((own, helper)) = worker.join().unwrap() {
+            assert_eq!((own, helper), (libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK, libc::SCHED_OTHER));
         }
     }
 

@@ -69,6 +69,7 @@ pub struct Hub<H: Host> {
     inner: RefCell<Inner<H>>,
     notify: [Notify; MAX_CLIENTS],
     wire: Notify,
+    rail_room: Notify,
     alarm: AsyncFd<OwnedFd>,
 }
 
@@ -90,6 +91,7 @@ impl<H: Host + 'static> Hub<H> {
             }),
             notify: std::array::from_fn(|_| Notify::new()),
             wire: Notify::new(),
+            rail_room: Notify::new(),
             alarm: watch::readable(timer)?,
         }))
     }
@@ -114,6 +116,9 @@ impl<H: Host + 'static> Hub<H> {
         }
         if bus.wire_wants() {
             self.wire.notify_one();
+        }
+        if bus.take_rail_room_again() {
+            self.rail_room.notify_one();
         }
         let next_ns = feed_ns.into_iter().chain(bus_ns).min();
         if next_ns != inner.alarm_ns {
@@ -146,6 +151,11 @@ impl<H: Host + 'static> Hub<H> {
     /// Waits until the wire could have another frame.
     pub async fn wire_wanted(&self) {
         self.wire.notified().await;
+    }
+
+    /// Waits until the queue of the rail, which was full, has room.
+    pub async fn rail_room(&self) {
+        self.rail_room.notified().await;
     }
 
     /// Looks at bus and host without letting the bus run.
@@ -291,7 +301,11 @@ impl<H: Host + 'static> Hub<H> {
                     tokio::task::yield_now().await;
                     continue;
                 }
-                Some(Stopped::WriteFirst) if !blocked => continue,
+                Some(Stopped::WriteFirst) if !blocked => {
+                    // An answer is a call to the system: thousands of questions in one segment must wait their turn.
+                    tokio::task::yield_now().await;
+                    continue;
+                }
                 Some(Stopped::Close) => return self.farewell(stream, number).await,
                 None if finished => return self.farewell(stream, number).await,
                 _ => {}
@@ -351,14 +365,19 @@ impl<H: Host + 'static> Hub<H> {
     }
 }
 
-/// Latency before packing; and a peer that vanished without a word frees its place within a minute.
-pub(crate) fn prepare(stream: &TcpStream) -> io::Result<()> {
+/// How long a peer may leave what it was sent without acknowledgement, or its window closed.
+const UNANSWERED_MS: u32 = 60_000;
+
+/// Latency before packing; and a peer that vanished without a word frees its place within a minute or so, whether something
+/// is on its way to it (then the system does not probe, and would go on for a quarter of an hour) or not.
+pub fn prepare(stream: &TcpStream) -> io::Result<()> {
     use rustix::net::sockopt;
     stream.set_nodelay(true)?;
     sockopt::set_socket_keepalive(stream, true)?;
     sockopt::set_tcp_keepidle(stream, Duration::from_secs(30))?;
     sockopt::set_tcp_keepintvl(stream, Duration::from_secs(10))?;
     sockopt::set_tcp_keepcnt(stream, 3)?;
+    sockopt::set_tcp_user_timeout(stream, UNANSWERED_MS)?;
     Ok(())
 }
 

@@ -30,6 +30,14 @@ struct Change {
     low: i32,
 }
 
+impl Change {
+    /// How many have it open after this, when there were `open` before, and whether there was nobody in between. Never less
+    /// than none: the kernel tells two openings in a row as one, and a count below none would hide the next client.
+    fn after(self, open: i32) -> (i32, bool) {
+        ((open + self.sum).max(0), open + self.low <= 0)
+    }
+}
+
 /// A pseudo-terminal with its link.
 pub struct Pty {
     port: Port,
@@ -85,8 +93,8 @@ impl Pty {
         let peer = self.link.display().to_string();
         let mut open = 0i32;
         loop {
-            while open <= 0 {
-                open += self.events().await?.sum;
+            while open == 0 {
+                open = self.events().await?.after(open).0;
             }
             let Some(number) = hub.enter(&peer, Dialect::Slcan) else {
                 tokio::time::sleep(Duration::from_millis(100)).await;
@@ -101,10 +109,10 @@ impl Pty {
             // The next one may be there already: nothing of the last one's is for it.
             hub.look(|bus, _| bus.mute(number));
             self.discard();
-            if gone && open <= 0 {
+            if gone && open == 0 {
                 tokio::select! {
                     biased;
-                    events = self.events() => open += events?.sum,
+                    events = self.events() => open = events?.after(open).0,
                     _ = tokio::time::timeout(LAST_WORDS, hub.converse(&self.port, number)) => {}
                 }
             }
@@ -115,10 +123,9 @@ impl Pty {
     /// Until the last of those who had it open has closed it, even when somebody opened it again since.
     async fn closed(&self, open: &mut i32) -> io::Result<()> {
         loop {
-            let change = self.events().await?;
-            let before = *open;
-            *open += change.sum;
-            if before + change.low <= 0 {
+            let (now, nobody) = self.events().await?.after(*open);
+            *open = now;
+            if nobody {
                 return Ok(());
             }
         }
@@ -133,6 +140,8 @@ impl Pty {
             let mut change = None;
             loop {
                 match reader.next() {
+                    // Too many to be told: which is not known.
+                    Ok(event) if event.events().contains(inotify::ReadFlags::QUEUE_OVERFLOW) => {}
                     Ok(event) => {
                         let step = if event.events().contains(inotify::ReadFlags::OPEN) { 1 } else { -1 };
                         let Change { sum, low } = change.get_or_insert(Change { sum: 0, low: 0 });
@@ -178,6 +187,19 @@ fn make_raw(fd: BorrowedFd<'_>) -> io::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn openings_told_as_one_hide_nobody() {
+        let opened = Change { sum: 1, low: 0 };
+        let closed = Change { sum: -1, low: -1 };
+        // Two openings at once, then two closings, each told by itself.
+        let (open, _) = opened.after(0);
+        assert_eq!((open, closed.after(open)), (1, (0, true)));
+        let (open, _) = closed.after(0);
+        assert_eq!(opened.after(open).0, 1, "the next client is seen");
+        assert_eq!(Change { sum: 0, low: -1 }.after(1), (1, true), "gone and here again");
+        assert_eq!(Change { sum: 0, low: 0 }.after(1), (1, false), "a second one came and went");
+    }
 
     #[test]
     fn a_terminal_becomes_a_pipe() {

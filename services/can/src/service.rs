@@ -134,7 +134,10 @@ pub fn run(ctx: Context) -> Result<(), RunError> {
         .enable_all()
         .build()
         .map_err(system("starting the event loop"))?;
-    tokio::task::LocalSet::new().block_on(&runtime, serve(ctx, &config))
+    let end = tokio::task::LocalSet::new().block_on(&runtime, serve(ctx, &config));
+    // Looking for a host's name or opening a device may take long, and nobody waits for it any more.
+    runtime.shutdown_background();
+    end
 }
 
 /// The rail as the bus sees it.
@@ -200,12 +203,15 @@ impl Rail {
         let limit = bus.rail_room().min(TAKE_FRAMES);
         let invalid = &mut self.invalid;
         let taken = self.tx.drain(limit, |message, _| {
-            let frame =
+            let mut frame =
                 Frame { can_id: message.can_id, len: message.len, fd: message.fd_flags, data: message.data };
             if frame.validate().is_err() || frame.is_error() {
                 *invalid += 1;
                 return;
             }
+            // A writer may leave anything behind its data; the kernel's echo, by which the frame is known again, does not.
+            let used = frame.payload().len();
+            frame.data[used..].fill(0);
             let newest = message.flags & can_flag::NEWEST != 0;
             // What waited in the topic while a wire was down is as old as its stamp.
             let since_ns = if bus.has_wire() { message.stamp.t_ns.min(now_ns) } else { now_ns };
@@ -445,6 +451,8 @@ async fn work(
             () = tokio::task::yield_now(), if more => {
                 more = hub.turn(|bus, rail, now_ns| rail.take_tx(bus, now_ns));
             }
+            // A wire has taken a frame, and the topic may hold what had no place: its writers need not ring again.
+            () = hub.rail_room() => more = true,
             due = hub.alarm() => {
                 due.map_err(system("waiting for the clock of the bus"))?;
                 // A paced bus has room again: what waits in the topic goes on.

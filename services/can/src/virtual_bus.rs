@@ -187,6 +187,8 @@ pub struct VirtualBus {
     /// Clients that have new output, and clients whose queue has room again, one bit each.
     output_ready: u32,
     room_again: u32,
+    /// The queue of the rail was full and is not any more.
+    rail_room_again: bool,
 }
 
 impl VirtualBus {
@@ -207,6 +209,7 @@ impl VirtualBus {
             utc_offset_ns: 0,
             output_ready: 0,
             room_again: 0,
+            rail_room_again: false,
             settings,
         }
     }
@@ -405,7 +408,10 @@ impl VirtualBus {
         });
         let (_, origin) = rail.into_iter().chain(feed).chain(clients).min_by_key(|(key, _)| *key)?;
         let (frame, arrived_ns) = match origin {
-            Origin::Rail => self.rail.pop().map(|w| (w.frame, w.fresh_ns))?,
+            Origin::Rail => {
+                self.rail_room_again |= self.rail.room() == 0;
+                self.rail.pop().map(|w| (w.frame, w.fresh_ns))?
+            }
             Origin::Feed => self.feed.pop_front()?,
             Origin::Client(number) => {
                 let client = self.clients[number].as_mut()?;
@@ -452,6 +458,10 @@ impl VirtualBus {
                 Talk::Cannelloni { greeted: true, .. } => texts.cannelloni(frame),
                 _ => continue,
             };
+            if text.is_empty() {
+                // Its protocol has no form for this frame.
+                continue;
+            }
             if client.out.len() + text.len() > self.settings.client_buffer {
                 client.counters.dropped += 1;
                 self.counters.client_drops += 1;
@@ -499,6 +509,11 @@ impl VirtualBus {
     /// Clients whose queue has room again since the last call, one bit each.
     pub fn take_room_again(&mut self) -> u32 {
         std::mem::take(&mut self.room_again)
+    }
+
+    /// Whether the queue of the rail was full and has room again since the last call.
+    pub fn take_rail_room_again(&mut self) -> bool {
+        std::mem::take(&mut self.rail_room_again)
     }
 
     /// Load in per mille of the last second.

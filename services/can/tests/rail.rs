@@ -117,6 +117,11 @@ fn a_bus_on_the_rail() {
         );
         assert_eq!((echo.flags, echo.stamp.writer), (can_flag::TX_ECHO, 1));
     }
+    // What stands behind the data of a frame is not of the frame.
+    let mut dirty = CanFrame::classic(0x124, &[1, 2]);
+    dirty.data[2..].fill(0xEE);
+    probe.send(dirty);
+    assert_eq!(probe.receive(1)[0].data, CanFrame::classic(0x124, &[1, 2]).data);
     // What cannot exist on a bus is dropped and counted.
     probe.send(CanFrame { len: 9, ..CanFrame::default() });
 
@@ -141,7 +146,7 @@ fn a_bus_on_the_rail() {
     let mut text = String::new();
     wait("the counters of all frames", || {
         status.newest(|_, tail| text = String::from_utf8_lossy(tail).into_owned());
-        (text.contains("\"tx_invalid\":1") && text.contains("\"tx\":40004")).then_some(())
+        (text.contains("\"tx_invalid\":1") && text.contains("\"tx\":40005")).then_some(())
     });
     assert!(text.contains("\"protocol\":\"socketcand\"") || text.contains("\"clients\":[]"), "{text}");
 }

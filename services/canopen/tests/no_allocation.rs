@@ -28,7 +28,13 @@ fn rx(cob_id: u32, transmission: u8, at: u32, range: u16) -> RxPdo {
 #[test]
 fn queues_samples_and_outputs_allocate_nothing() {
     let plan = Plan {
-        rx: vec![rx(0x185, 255, 0, 0), rx(0x285, 1, 2, 1), rx(0x385, 255, 4, 2)],
+        rx: vec![
+            rx(0x185, 255, 0, 0),
+            rx(0x285, 1, 2, 1),
+            rx(0x385, 255, 4, 2),
+            rx(0x485, 3, 6, 3),
+            rx(0x486, 0, 8, 4),
+        ],
         tx: vec![TxPdo {
             cob_id: 0x205,
             node: 5,
@@ -38,7 +44,7 @@ fn queues_samples_and_outputs_allocate_nothing() {
             event_ns: None,
             fields: vec![field(0, 0)],
         }],
-        input_bytes: vec![2, 2, 2],
+        input_bytes: vec![2; 5],
         output_bytes: 2,
         states: Vec::new(),
         queues: vec![(0, 16)],
@@ -48,7 +54,7 @@ fn queues_samples_and_outputs_allocate_nothing() {
     exchange.set_operational(5, true, 0);
     let allocated = allocations(|| {
         for t_ns in 1..2000u64 {
-            for id in [0x185, 0x185, 0x285, 0x385] {
+            for id in [0x185, 0x185, 0x285, 0x385, 0x485, 0x486] {
                 exchange.on_frame(t_ns, &CanFrame::classic(id, &(t_ns as u16).to_le_bytes()));
             }
             if t_ns.is_multiple_of(10) {

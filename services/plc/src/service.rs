@@ -11,6 +11,8 @@ mod status;
 mod trigger;
 mod watch;
 
+pub use jobs::MAX_SET;
+
 use crate::config::{Config, OnFault, Trigger};
 use crate::engine::{Engine, EngineError, Runtime, RuntimeError};
 use crate::program::{self, ProgramError};

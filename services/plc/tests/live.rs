@@ -31,12 +31,14 @@ const RETAIN: &str = "DINRAIL_PLC_TEST_RETAIN";
 const PATIENCE: Duration = Duration::from_mins(1);
 
 const MAIN: &str = "PROGRAM main
-VAR out AT %QW0 : UINT; setpoint AT %MW0 : UINT; sel : INT; zero : INT; r : INT; t : TON; scans : UDINT; END_VAR
+VAR out AT %QW0 : UINT; setpoint AT %MW0 : UINT; sel : INT; zero : INT; r : INT; t : TON; scans : UDINT;
+  a : INT; b : INT; torn : INT; END_VAR
 VAR RETAIN kept : UDINT; END_VAR
   scans := scans + 1; kept := kept + 1;
   t(IN := TRUE, PT := T#1h);
   out := Level * 2 + setpoint;
   IF sel = 1 THEN r := 10 / zero; END_IF;
+  IF a <> b THEN torn := torn + 1; END_IF;
 END_PROGRAM";
 
 /// The plc service, when this executable is started as it.
@@ -351,6 +353,20 @@ fn a_plc_service_from_its_first_scan_to_its_return_from_death() {
     assert_eq!(world.job(&json!({ "do": "unforce", "var": "out" })).0, 0);
     world.until("the end of the force", |w| w.out() == Some(142));
     assert_eq!(world.job(&json!({ "do": "dance" })).0, 3);
+
+    // Several variables are written in one scan or not at all; forces too.
+    let both = |a: i32, b: i32| json!([{ "var": "a", "value": a }, { "var": "b", "value": b }]);
+    for value in 1..=20 {
+        let job = json!({ "do": "write", "set": both(value, value) });
+        assert_eq!(world.job(&job), (0, json!({ "ok": true })));
+    }
+    let (code, body) = world.job(&json!({ "do": "write", "set": both(1, 70_000) }));
+    assert_eq!(code, 1, "{body}");
+    assert_eq!((world.read("a"), world.read("b"), world.read("torn")), (json!(20), json!(20), json!(0)));
+    assert_eq!(world.job(&json!({ "do": "force", "set": both(5, 5) })).0, 0);
+    assert_eq!(world.job(&json!({ "do": "status" })).1["ok"]["forces"], json!(["a", "b"]));
+    assert_eq!((world.read("a"), world.read("b"), world.read("torn")), (json!(5), json!(5), json!(0)));
+    assert_eq!(world.job(&json!({ "do": "unforce_all" })).0, 0);
     let (code, body) = world.job(&json!({ "do": "read", "var": "outt" }));
     assert_eq!((code, body["error"].as_str().unwrap()), (1, "no variable 'outt'"));
     assert_eq!(world.job(&json!({ "do": "status" })).1["ok"]["state"], "run");
@@ -366,11 +382,23 @@ fn a_plc_service_from_its_first_scan_to_its_return_from_death() {
     world.level = Some(5);
     world.until("good inputs", |w| w.out() == Some(110) && w.area[10] == 0);
 
+    // Who stops a faulted program keeps it so, whatever the policy.
+    world.seen.clear();
+    assert_eq!(world.job(&json!({ "do": "write", "var": "sel", "value": 1 })).0, 0);
+    world.event(EventKind::ProgramFault);
+    assert_eq!(world.job(&json!({ "do": "stop" })).0, 0);
+    let stopped_ns = world.image.stamp.t_ns;
+    world.until("more than the pause before a start", |w| w.image.stamp.t_ns > stopped_ns + 1_500_000_000);
+    assert_eq!(world.image.plc_state(), PlcState::Fault);
+    assert_eq!(world.job(&json!({ "do": "run" })).0, 0);
+    world.until("the start by hand", |w| w.image.plc_state() == PlcState::Run && w.out() == Some(10));
+    world.seen.clear();
+
     // A fault, named, and the warm start of the policy.
     let kept = world.read("kept").as_u64().unwrap();
     assert_eq!(world.job(&json!({ "do": "write", "var": "sel", "value": 1 })).0, 0);
     let fault = world.event(EventKind::ProgramFault);
-    assert_eq!((&fault.detail["file"], &fault.detail["line"]), (&json!("main.st"), &json!(7)));
+    assert_eq!((&fault.detail["file"], &fault.detail["line"]), (&json!("main.st"), &json!(8)));
     world.until("the warm start", |w| {
         w.image.plc_state() == PlcState::Run && w.seen.iter().any(|e| e.detail["start"] == "warm")
     });

@@ -233,13 +233,15 @@ impl Driver {
 
     fn write(&mut self, from: usize, to: usize, now_ns: u64) -> io::Result<()> {
         let (_, bytes) = self.sender.current();
+        let n = self.port.write(&bytes[from..to])?;
+        // Nothing comes back of what the port did not take, and it is asked again and again.
         if from == 0
+            && n > 0
             && let Some(echo) = &mut self.echo
         {
             // Until the end is known: its own time and a second.
             echo.expect(bytes, now_ns + 1_000_000_000 + bytes.len() as u64 * 20_000_000);
         }
-        let n = self.port.write(&bytes[from..to])?;
         self.sender.wrote(n, now_ns);
         Ok(())
     }
@@ -324,5 +326,55 @@ impl Counters {
                 missing: self.echo.missing + o.echo.missing,
             },
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Config, EchoMode};
+    use crate::port::Kind;
+    use std::path::Path;
+
+    #[test]
+    fn a_port_that_takes_nothing_yet_misses_no_echo() {
+        let dir = std::env::temp_dir();
+        let link = dir.join(format!("dinrail-serial-full-{}", std::process::id()));
+        let made = Config::of_device(&format!("pty:{}", link.display()));
+        let mut other = Port::open(&made.options(Path::new("/")).unwrap()).unwrap();
+        let mut config = Config::of_device(link.to_str().unwrap());
+        config.echo = EchoMode::Discard;
+        let mut port = Port::open(&config.options(Path::new("/")).unwrap()).unwrap();
+        assert!(other.visited());
+        let mut filled = 0;
+        loop {
+            match port.write(&[0; 4096]).unwrap() {
+                0 => break,
+                n => filled += n,
+            }
+        }
+        let mut driver = Driver::new(port, &config.settings(Kind::Pty));
+        assert!(driver.load(Head::default(), b"hello", 0));
+        let mut echoes = 0;
+        let mut sink = |header: SerialChunk, _: &[u8], _: u64| {
+            assert_eq!(header.flags & serial_flag::NOT_SENT, 0);
+            echoes += 1;
+        };
+        for turn in 0..20 {
+            driver.turn(turn * 20_000_000, &mut sink).unwrap();
+        }
+        assert_eq!((driver.counters().echo.missing, driver.is_idle()), (0, false));
+        // It takes it when there is room.
+        let mut bytes = [0; 4096];
+        let mut now_ns = 500_000_000;
+        ipc_types::testing::wait("the last byte", || {
+            while let Ok(Read::Bytes(n, _)) = other.read(&mut bytes) {
+                filled = filled.saturating_sub(n);
+            }
+            now_ns += 1_000_000;
+            driver.turn(now_ns.min(900_000_000), &mut sink).unwrap();
+            driver.is_idle().then_some(())
+        });
+        assert_eq!((echoes, driver.counters().tx.frames), (1, 1));
     }
 }

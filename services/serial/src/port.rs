@@ -22,6 +22,8 @@ use crate::sys::{self, LineCounters, Rs485};
 
 /// How long a TCP connection may take.
 const CONNECT: Duration = Duration::from_secs(5);
+/// How long a TCP peer may leave what it was sent without acknowledgement: as long as one that is silent is probed.
+const UNANSWERED_MS: u32 = 20_000;
 
 /// Where the bytes go.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -393,7 +395,9 @@ fn hung_up(fd: BorrowedFd<'_>) -> bool {
     use rustix::event::{PollFd, PollFlags, Timespec, poll};
     let mut fds = [PollFd::new(&fd, PollFlags::IN)];
     let _ = poll(&mut fds, Some(&Timespec { tv_sec: 0, tv_nsec: 0 }));
-    fds[0].revents().contains(PollFlags::HUP)
+    let is = fds[0].revents();
+    // What somebody wrote before leaving is still to be read.
+    is.contains(PollFlags::HUP) && !is.contains(PollFlags::IN)
 }
 
 fn device(path: &Path, options: &Options) -> Result<Port, PortError> {
@@ -515,6 +519,8 @@ fn socket(address: &str) -> io::Result<Port> {
                 let _ = rustix::net::sockopt::set_tcp_keepidle(&stream, Duration::from_secs(10));
                 let _ = rustix::net::sockopt::set_tcp_keepintvl(&stream, Duration::from_secs(3));
                 let _ = rustix::net::sockopt::set_tcp_keepcnt(&stream, 3);
+                // With bytes on their way the system does not probe, and would go on for a quarter of an hour.
+                let _ = rustix::net::sockopt::set_tcp_user_timeout(&stream, UNANSWERED_MS);
                 return Ok(Port::plain(Wire::Other(stream.into()), Kind::Tcp, address.to_owned()));
             }
             Err(e) => last = e,

@@ -79,12 +79,28 @@ fn a_terminal_of_our_own_and_its_other_end() {
     assert!(std::fs::symlink_metadata(&link).is_err());
 }
 
+/// `echo text > line`: written and gone before anybody looked.
+#[test]
+fn what_a_visitor_wrote_before_leaving_is_read() {
+    let link = scratch("brief");
+    let mut made = Port::open(&options(Target::Terminal(link.clone()))).unwrap();
+    let mut visitor = std::fs::OpenOptions::new().write(true).open(&link).unwrap();
+    std::io::Write::write_all(&mut visitor, b"last words").unwrap();
+    drop(visitor);
+    assert!(made.visited());
+    assert_eq!(read_all(&mut made), b"last words");
+    assert_eq!(made.read(&mut [0; 8]).unwrap(), Read::Nobody);
+    assert!(!made.visited());
+}
+
 #[test]
 fn tcp() {
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap().to_string();
     let mut port = Port::open(&options(Target::Socket(address.clone()))).unwrap();
     let (mut peer, _) = listener.accept().unwrap();
+    // A peer that vanishes with bytes on their way to it is gone as soon as a silent one.
+    assert_eq!(rustix::net::sockopt::tcp_user_timeout(port.fd()).unwrap(), 20_000);
     std::io::Write::write_all(&mut peer, b"hello").unwrap();
     assert_eq!(read_all(&mut port), b"hello");
     drop(peer);

@@ -28,7 +28,7 @@ impl Listener {
         let mut readers = Vec::new();
         for bus in &buses {
             let name = topic(ctx, bus, TopicKind::CanRx)?;
-            readers.push(place(ctx, ctx.subscriber::<CanFrame>(&name))?);
+            readers.push(place(&ctx.stack, || ctx.subscriber::<CanFrame>(&name))?);
         }
         let merge = Merge::new(buses.len(), HOLD_NS);
         Ok(Self { buses, readers, merge })

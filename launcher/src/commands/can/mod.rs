@@ -25,13 +25,14 @@ mod stats;
 
 use crate::commands::UsageError;
 use crate::stackfile::nearest;
-use crate::supervise::client::{find, is_full, observe};
+use crate::supervise::client::{find, is_full, observe, with_room};
 use args::CanCommand;
 use dinrail_can::protocol::frame::Frame;
-use ipc_types::Context;
 use ipc_types::payload::CanFrame;
+use ipc_types::rail::RailError;
 use ipc_types::topic::TopicKind;
 use ipc_types::units::Span;
+use ipc_types::{Context, Stack};
 use std::io::Write;
 use std::process::ExitCode;
 use std::time::Instant;
@@ -61,8 +62,8 @@ fn crowded(stack: &str) -> anyhow::Error {
 }
 
 /// A port on a topic; when it has no place left, in words.
-fn place<T>(ctx: &Context, port: Result<T, ipc_types::rail::RailError>) -> anyhow::Result<T> {
-    port.map_err(|e| if is_full(&e) { crowded(&ctx.stack.name) } else { e.into() })
+fn place<T>(stack: &Stack, open: impl FnMut() -> Result<T, RailError>) -> anyhow::Result<T> {
+    with_room(&stack.root, open).map_err(|e| if is_full(&e) { crowded(&stack.name) } else { e.into() })
 }
 
 /// Prints; false when nobody reads any more. Not by ending the process: its place on the rail must be given back.

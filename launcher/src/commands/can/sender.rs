@@ -62,9 +62,9 @@ impl Sender {
         let others =
             ctx.stack.topic(&TopicKind::CanTx.of(bus)).map(|t| t.writers.clone()).unwrap_or_default();
         let (rx, tx) = (topic(ctx, bus, TopicKind::CanRx)?, topic(ctx, bus, TopicKind::CanTx)?);
-        let rx = place(ctx, ctx.subscriber::<CanFrame>(&rx))?;
-        let tx = ctx.publisher::<CanFrame>(&tx);
-        let tx = place(ctx, tx)?;
+        let stack = ctx.stack.clone();
+        let rx = place(&stack, || ctx.subscriber::<CanFrame>(&rx))?;
+        let tx = place(&stack, || ctx.publisher::<CanFrame>(&tx))?;
         // Short waits shall be short. Where it is refused they are a little longer.
         let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(1000));
         Ok(Self {

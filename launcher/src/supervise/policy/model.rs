@@ -178,7 +178,8 @@ pub struct Slot {
     pub since: u64,
     /// When the present process reported ready; 0 = not yet.
     pub ready_at: u64,
-    pub(super) last_sign: u64,
+    /// From when on its silence counts: its start until it is ready, then its last heartbeat.
+    pub(super) silent_from: u64,
     /// Times of unplanned restarts within the budget's window.
     pub(super) recent: VecDeque<u64>,
     /// Failures since the last healthy run.

@@ -1,6 +1,6 @@
 //! Processes of the loop: started, read, reaped, cleaned up after, and what is said about them.
 
-use super::super::child::Exit;
+use super::super::child::{Exit, Left};
 use super::super::ground;
 use super::super::logbook::{self, Line};
 use super::super::policy::{Death, Kill, Notice};
@@ -56,7 +56,7 @@ impl Supervisor {
         let (death, output) = match watch(&mut self.reactor) {
             Ok(wakes) => wakes,
             Err(e) => {
-                child.signal(Kill::Now);
+                child.end();
                 return Err(e.to_string());
             }
         };
@@ -81,7 +81,7 @@ impl Supervisor {
             Ok(None) => return,
             Err(_) => Exit::Code(-1),
         };
-        self.read_output(service);
+        self.read_rest(service);
         if let Some(line) = self.logbook.flush(service, clock::utc_ns()) {
             self.show(&line);
         }
@@ -119,13 +119,27 @@ impl Supervisor {
         let mut lines = Vec::new();
         let logbook = &mut self.logbook;
         let utc_ns = clock::utc_ns();
-        let open = child.read(&mut [0u8; 8192], |bytes| {
+        let left = child.read(&mut [0u8; 8192], |bytes| {
             logbook.feed(service, bytes, utc_ns, |line| lines.push(line.clone()));
         });
-        if !open {
+        if left == Left::End {
             // It closed its output but lives on: nothing more comes, and an ended pipe would wake for ever.
             let _ = self.reactor.remove(child.output());
         }
+        for line in lines {
+            self.show(&line);
+        }
+    }
+
+    /// All that a dead one still had to say.
+    fn read_rest(&mut self, service: usize) {
+        let Some(child) = &self.services[service].child else { return };
+        let mut lines = Vec::new();
+        let logbook = &mut self.logbook;
+        let utc_ns = clock::utc_ns();
+        child.read_rest(&mut [0u8; 8192], |bytes| {
+            logbook.feed(service, bytes, utc_ns, |line| lines.push(line.clone()));
+        });
         for line in lines {
             self.show(&line);
         }
@@ -170,8 +184,13 @@ impl Supervisor {
 
     pub(super) fn start_cleaner(&mut self) {
         let started = self.executable.spawn_cleaner(&self.stack.root).and_then(|child| {
-            let wake = self.reactor.add(child.pidfd())?;
-            Ok((child, wake))
+            match self.reactor.add(child.pidfd()) {
+                Ok(wake) => Ok((child, wake)),
+                Err(e) => {
+                    child.end();
+                    Err(e)
+                }
+            }
         });
         match started {
             Ok((child, wake)) => {

@@ -198,10 +198,12 @@ impl Peer for Client {
                     out.extend(self.bus.as_bytes());
                     out.extend(b" >");
                     self.state = State::Open;
+                    self.until_ns = now_ns + ANSWER_NS;
                 }
                 (State::Open, Answer::Ok) => {
                     out.extend(b"< rawmode >");
                     self.state = State::Raw;
+                    self.until_ns = now_ns + ANSWER_NS;
                 }
                 (State::Raw, Answer::Ok) => {
                     self.state = State::Up;
@@ -224,9 +226,9 @@ impl Peer for Client {
                     return self
                         .fault("what answers is no socketcand: it does not greet with < hi >".into(), heard);
                 }
+                // Whatever else it says is not the answer that is waited for.
                 _ => {}
             }
-            self.until_ns = now_ns + ANSWER_NS;
         }
     }
 
@@ -272,6 +274,18 @@ mod tests {
     use super::super::socketcand;
     use super::*;
     use proptest::prelude::*;
+
+    #[test]
+    fn only_the_answer_that_is_waited_for_ends_the_wait() {
+        let (mut client, mut out, mut heard) = (Client::new("can0"), Vec::new(), Vec::new());
+        client.connected(0, &mut out);
+        client.receive(b"< hi >", 1, &mut out, &mut |h| heard.push(h));
+        for second in 1..10 {
+            client.receive(b"< frame 123 1.0 11 >", second * 1_000_000_000, &mut out, &mut |h| heard.push(h));
+            client.tick(second * 1_000_000_000, &mut out, &mut |h| heard.push(h));
+        }
+        assert_eq!(heard, [Heard::Fault("the server did not give the answer to open within 5 s".into())]);
+    }
 
     fn all(text: &[u8]) -> Vec<Answer> {
         let (mut decoder, mut rest, mut answers) = (Decoder::default(), text, Vec::new());

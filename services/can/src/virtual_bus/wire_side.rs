@@ -145,6 +145,15 @@ impl VirtualBus {
         }
     }
 
+    /// The wire did not take the frame that [`Self::wire_next`] gave last.
+    pub fn wire_not_taken(&mut self) {
+        if let Some(wire) = &mut self.wire
+            && wire.flight.pop_back().is_some()
+        {
+            wire.counters.lost += 1;
+        }
+    }
+
     /// A frame came from the wire.
     pub fn wire_received(&mut self, frame: &Frame, t_ns: u64, tap: &mut impl Tap) {
         let Some(wire) = &mut self.wire else { return };

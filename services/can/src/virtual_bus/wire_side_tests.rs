@@ -127,3 +127,29 @@ fn confirmed_and_refused_in_order() {
     assert_eq!(seen.0.iter().map(|(text, _)| text.as_str()).collect::<Vec<_>>(), ["100#01", "100#03"]);
     assert_eq!(bus.wire_counters().unwrap().lost, 1);
 }
+
+#[test]
+fn what_the_wire_does_not_take_leaves_its_own_place() {
+    let (mut bus, mut seen) = (bus(true), Seen::default());
+    for text in ["100#01", "200#02"] {
+        push(&mut bus, text, 1);
+    }
+    assert_eq!((next(&mut bus, 2), next(&mut bus, 2)), (Some("100#01".into()), Some("200#02".into())));
+    bus.wire_not_taken();
+    bus.wire_echo(&parse("100#01").unwrap(), 3, &mut seen);
+    assert_eq!(bus.wire_overdue(4), None, "nothing is on its way");
+    assert_eq!(bus.wire_counters().unwrap().lost, 1);
+}
+
+#[test]
+fn room_in_a_full_queue_is_told_once() {
+    let mut bus = bus(true);
+    for i in 0..16 {
+        push(&mut bus, &format!("1{i:02X}#"), 1);
+    }
+    assert!(!bus.take_rail_room_again());
+    assert!(next(&mut bus, 2).is_some());
+    assert!(bus.take_rail_room_again() && !bus.take_rail_room_again());
+    assert!(next(&mut bus, 2).is_some());
+    assert!(!bus.take_rail_room_again(), "it was not full any more");
+}

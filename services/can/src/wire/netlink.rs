@@ -107,7 +107,8 @@ fn to_io(e: socketcan::Error) -> io::Error {
     }
 }
 
-fn denied(e: &LinkError) -> bool {
+/// This process may not do that.
+pub(super) fn denied(e: &LinkError) -> bool {
     matches!(e, LinkError::System { source, .. } if source.kind() == io::ErrorKind::PermissionDenied)
 }
 

@@ -31,7 +31,9 @@ impl Port {
     pub fn try_read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match self {
             Self::Tcp(stream) => stream.try_read(buffer),
-            Self::Tty(fd) => fd.try_io(Interest::READABLE, |fd| Ok(rustix::io::read(fd, &mut *buffer)?)),
+            Self::Tty(fd) => fd.try_io(Interest::READABLE, |fd| {
+                Ok(rustix::io::retry_on_intr(|| rustix::io::read(fd, &mut *buffer))?)
+            }),
         }
     }
 
@@ -39,7 +41,9 @@ impl Port {
     pub fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
         match self {
             Self::Tcp(stream) => stream.try_write(bytes),
-            Self::Tty(fd) => fd.try_io(Interest::WRITABLE, |fd| Ok(rustix::io::write(fd, bytes)?)),
+            Self::Tty(fd) => fd.try_io(Interest::WRITABLE, |fd| {
+                Ok(rustix::io::retry_on_intr(|| rustix::io::write(fd, bytes))?)
+            }),
         }
     }
 

@@ -15,8 +15,9 @@ use crate::server::{Host, sleep_until};
 /// Bytes read at once.
 const READ_BYTES: usize = 16 * 1024;
 const PULLED: &str = "the adapter was pulled; it is tried again";
-/// Bytes that may wait to be written before no more frames are taken.
-const WRITE_BYTES: usize = 16 * 1024;
+/// Bytes that may wait to be written before no more frames are taken. Few, because a frame may count as sent when it is
+/// here, and one that is here is overtaken by none.
+const WRITE_BYTES: usize = 1024;
 
 /// Works for ever. Must run inside a `LocalSet`; the bus must have its wire attached with the peer's flight.
 pub async fn drive<H: Host + 'static>(line: Line<H>, target: Target, mut peer: Box<dyn Peer>) {
@@ -33,6 +34,7 @@ pub async fn drive<H: Host + 'static>(line: Line<H>, target: Target, mut peer: B
                     heard: Vec::with_capacity(1024),
                     last_ns: 0,
                     was_up: false,
+                    blocked: false,
                 };
                 let why = talk.run().await;
                 if talk.was_up {
@@ -54,6 +56,8 @@ struct Talk<'a, H: Host> {
     heard: Vec<Heard>,
     last_ns: u64,
     was_up: bool,
+    /// The other side did not take all that was written.
+    blocked: bool,
 }
 
 impl<H: Host + 'static> Talk<'_, H> {
@@ -62,15 +66,21 @@ impl<H: Host + 'static> Talk<'_, H> {
         let hub = self.line.hub.clone();
         let mut buffer = vec![0u8; READ_BYTES].into_boxed_slice();
         self.peer.connected(clock::mono_ns(), &mut self.out);
+        // A full buffer was read: more waits, and others must have their turn in between.
+        let mut flooded = false;
         loop {
             if let Err(why) = self.settle() {
                 let _ = self.port.try_write(self.peer.farewell());
                 return why;
             }
-            let blocked = match self.write() {
+            self.blocked = match self.write() {
                 Ok(blocked) => blocked,
                 Err(e) => return gone(&e),
             };
+            let blocked = self.blocked;
+            if std::mem::take(&mut flooded) {
+                tokio::task::yield_now().await;
+            }
             let interest = if blocked { Interest::READABLE | Interest::WRITABLE } else { Interest::READABLE };
             let deadline_ns = self.peer.deadline_ns();
             tokio::select! {
@@ -84,6 +94,7 @@ impl<H: Host + 'static> Talk<'_, H> {
                             };
                         }
                         Ok(n) => {
+                            flooded = n == READ_BYTES;
                             let heard = &mut self.heard;
                             self.peer.receive(&buffer[..n], clock::mono_ns(), &mut self.out, &mut |h| heard.push(h));
                         }
@@ -135,6 +146,9 @@ impl<H: Host + 'static> Talk<'_, H> {
     }
 
     fn give(&mut self) {
+        if self.blocked {
+            return;
+        }
         let (peer, out, heard) = (&mut *self.peer, &mut self.out, &mut self.heard);
         self.line.hub.turn(|bus, _, now_ns| {
             while out.len() < WRITE_BYTES
@@ -201,3 +215,7 @@ fn gone(e: &io::Error) -> String {
         _ => format!("{e}; it is tried again"),
     }
 }
+
+#[cfg(test)]
+#[path = "remote_tests.rs"]
+mod tests;

@@ -10,8 +10,10 @@ use std::time::Duration;
 
 use ipc_types::clock;
 use ipc_types::event::Level;
+use ipc_types::net::Seldom;
 use socketcan::{CanFdSocket, Socket, SocketOptions};
 use tokio::io::unix::AsyncFd;
+use tokio::time::Instant;
 
 use super::filter::Filter;
 use super::netlink::{self, Interface, LinkError, Wanted};
@@ -143,7 +145,10 @@ struct Wire<'a, H: Host> {
     utc_offset_ns: i64,
     restarts: u32,
     restart_at_ns: Option<u64>,
+    /// In bus-off: the kernel throws away without a word what it is given now.
+    off: bool,
     no_ack_said: bool,
+    look_failed: Seldom,
 }
 
 impl<'a, H: Host + 'static> Wire<'a, H> {
@@ -166,7 +171,9 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
             utc_offset_ns: clock::utc_offset_ns(),
             restarts: 0,
             restart_at_ns: None,
+            off: false,
             no_ack_said: false,
+            look_failed: Seldom::default(),
         }
     }
 
@@ -176,9 +183,12 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
         }
         self.line.status.borrow_mut().filters = self.settings.filters.len();
         let hub = self.line.hub.clone();
+        let mut next_look = Instant::now() + LOOK;
         loop {
             let up = self.line.status.borrow().up;
-            let look = if up { self.until_restart().unwrap_or(LOOK) } else { DOWN_LOOK };
+            let pause = if up { self.until_restart().unwrap_or(LOOK) } else { DOWN_LOOK };
+            // Frames that keep coming must not put it off.
+            next_look = next_look.min(Instant::now() + pause);
             let end = tokio::select! {
                 ready = self.socket.readable() => match ready {
                     Ok(mut guard) => {
@@ -191,7 +201,10 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
                 () = tokio::task::yield_now(), if self.again => self.exchange(),
                 () = hub.wire_wanted(), if self.held.is_none() => self.exchange(),
                 () = tokio::time::sleep(BUSY), if self.held.is_some() && up => self.exchange(),
-                () = tokio::time::sleep(look) => self.look(),
+                () = tokio::time::sleep_until(next_look) => {
+                    next_look = Instant::now() + LOOK;
+                    self.look()
+                }
             };
             if let End::Gone(why) = end {
                 return self.line.down(why);
@@ -200,6 +213,7 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
     }
 
     fn raised(&mut self) {
+        self.off = false;
         let name = &self.settings.wanted.name;
         let rate = self.interface.bitrate.map(|rate| format!(" at {rate} bit/s")).unwrap_or_default();
         self.line
@@ -333,7 +347,7 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
             Some(e) => {
                 // The kernel does not want this frame: the next one may be better.
                 self.held = None;
-                hub.look(|bus, _| bus.wire_refused());
+                hub.look(|bus, _| bus.wire_not_taken());
                 self.line.say(
                     Level::Warning,
                     format!("interface {} refuses a frame: {e}", self.settings.wanted.name),
@@ -345,6 +359,7 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
 
     fn fell(&mut self) {
         self.held = None;
+        self.off = false;
         self.restart_at_ns = None;
         let wanted = &self.settings.wanted;
         let command = netlink::command(wanted, &self.interface);
@@ -359,7 +374,14 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
         let name = &self.settings.wanted.name;
         self.utc_offset_ns = clock::utc_offset_ns();
         match netlink::look(name) {
-            Err(e) => return End::Gone(e.to_string()),
+            Err(e @ (LinkError::Absent { .. } | LinkError::NoCan)) => return End::Gone(e.to_string()),
+            // The socket works, and would say if the interface went: no reason to lose frames by opening it anew.
+            Err(e) => {
+                if let Some(untold) = self.look_failed.failed(clock::mono_ns()) {
+                    tracing::warn!("{e} ({untold} more since last told)");
+                }
+                return self.exchange();
+            }
             Ok(is) if is.index != self.interface.index => {
                 return End::Gone(format!("interface {name} was pulled and plugged in again"));
             }
@@ -438,23 +460,32 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
     fn bus_off(&mut self, off: bool) {
         if !off {
             self.restart_at_ns = None;
-            return;
-        }
-        if self.restart_at_ns.is_some() {
+            if std::mem::take(&mut self.off) {
+                // What waited for too long is dropped, as when the interface was down.
+                self.line.hub.turn(|bus, _, now_ns| bus.wire_up(now_ns));
+            }
             return;
         }
         self.held = None;
-        self.line.hub.look(|bus, _| bus.wire_flush());
         if !self.interface.settable {
-            // Without a controller there is nothing to restart.
+            // Without a controller there is nothing to restart, and nobody would say that it is over.
+            self.line.hub.look(|bus, _| bus.wire_flush());
+            return;
+        }
+        self.off = true;
+        self.line.hub.look(|bus, _| bus.wire_down());
+        if self.restart_at_ns.is_some() {
             return;
         }
         let pause_ms = u64::from(self.settings.wanted.restart_ms);
         // The kernel does it by itself when it was told to.
-        if pause_ms > 0 && self.interface.restart_ms.unwrap_or(0) == 0 {
+        if self.interface.restart_ms.unwrap_or(0) > 0 {
+            return;
+        }
+        if pause_ms > 0 {
             let pause = restart_pause(Duration::from_millis(pause_ms), self.restarts);
             self.restart_at_ns = Some(clock::mono_ns() + pause.as_nanos() as u64);
-        } else if pause_ms == 0 {
+        } else {
             self.line.say(
                 Level::Warning,
                 format!("interface {0} stays in bus-off, because bus_off_restart = \"0ms\": `ip link set {0} type can restart`", self.settings.wanted.name),
@@ -481,6 +512,13 @@ impl<'a, H: Host + 'static> Wire<'a, H> {
                     self.line.status.borrow_mut().restarts += 1;
                 }
                 self.restart_at_ns = None;
+            }
+            Err(e) if !netlink::denied(&e) => {
+                let first = Duration::from_millis(u64::from(self.settings.wanted.restart_ms));
+                self.restarts += 1;
+                let pause = restart_pause(first, self.restarts);
+                self.restart_at_ns = Some(clock::mono_ns() + pause.as_nanos() as u64);
+                self.line.say(Level::Fault, format!("{e}; it is tried again in {} ms", pause.as_millis()));
             }
             Err(e) => {
                 self.restart_at_ns = Some(u64::MAX);

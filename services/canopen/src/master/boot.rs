@@ -129,6 +129,14 @@ pub struct Plan {
     pub sdo_tries: u8,
 }
 
+/// Why a configuration was loaded, by its date and time (1020h).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+pub struct Loaded {
+    /// Those that the node had; `None`: it did not tell them. 0 and 0: it has no configuration.
+    pub had: Option<(u32, u32)>,
+    pub expected: (u32, u32),
+}
+
 /// How an SDO transfer ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum SdoEnd {
@@ -220,6 +228,9 @@ pub struct Boot {
     /// Last NMT state it told.
     state: Option<u8>,
     kept: bool,
+    /// Date of its configuration (1020h:01), while the time is asked for.
+    had_date: u32,
+    loaded: Option<Loaded>,
     actions: Vec<Action>,
 }
 
@@ -239,6 +250,8 @@ impl Boot {
             fresh: false,
             state: None,
             kept: false,
+            had_date: 0,
+            loaded: None,
             actions: Vec::with_capacity(4),
         }
     }
@@ -249,6 +262,11 @@ impl Boot {
     /// Tries of the boot-up under way; of a node that runs, the tries it took.
     pub fn attempts(&self) -> u32 {
         if self.attempt > 0 { self.attempt } else { self.took }
+    }
+    /// Why the configuration was loaded in this try or the one that went well; `None`: it was not, or its date does not
+    /// count.
+    pub fn loaded(&self) -> Option<Loaded> {
+        self.loaded
     }
     /// When the last try began; 0: none did.
     pub fn began_ns(&self) -> u64 {
@@ -289,7 +307,7 @@ impl Boot {
     /// Starts, or starts again.
     pub fn start(&mut self, now_ns: u64) {
         self.attempt = self.attempt.saturating_add(1);
-        (self.began_ns, self.at_ns, self.kept) = (now_ns, None, false);
+        (self.began_ns, self.at_ns, self.kept, self.loaded) = (now_ns, None, false, None);
         self.read(Step::DeviceType);
     }
 
@@ -388,14 +406,20 @@ impl Boot {
                 let sub = self.plan.restore.unwrap_or(1);
                 self.fail(now_ns, Letter::J, |f| (f.object, f.abort) = (Some((0x1011, sub)), abort));
             }
-            Step::ConfigDate if value.is_some() && value == self.plan.config_stamp.map(|s| s.0) => {
-                self.read(Step::ConfigTime);
+            Step::ConfigDate => match value {
+                Some(date) => {
+                    self.had_date = date;
+                    self.read(Step::ConfigTime);
+                }
+                None => self.load(now_ns, None),
+            },
+            Step::ConfigTime => {
+                let had = value.map(|time| (self.had_date, time));
+                match had {
+                    Some(_) if had == self.plan.config_stamp => self.start_error_control(now_ns),
+                    _ => self.load(now_ns, had),
+                }
             }
-            Step::ConfigTime if value.is_some() && value == self.plan.config_stamp.map(|s| s.1) => {
-                self.start_error_control(now_ns);
-            }
-            // Another configuration, or none: it is loaded.
-            Step::ConfigDate | Step::ConfigTime => self.download(now_ns, 0),
             Step::Download(i) if matches!(end, SdoEnd::Written) => self.download(now_ns, i + 1),
             Step::Download(i) => {
                 let object = self.plan.writes.get(i).map(|w| (w.index, w.sub));
@@ -482,6 +506,12 @@ impl Boot {
         if self.plan.config_stamp.is_some() && !restored {
             return self.read(Step::ConfigDate);
         }
+        self.download(now_ns, 0);
+    }
+
+    /// The node has another configuration, or none.
+    fn load(&mut self, now_ns: u64, had: Option<(u32, u32)>) {
+        self.loaded = self.plan.config_stamp.map(|expected| Loaded { had, expected });
         self.download(now_ns, 0);
     }
 

@@ -183,10 +183,10 @@ fn an_equal_configuration_date_skips_the_download() {
         boot.on_boot_up(2);
         boot.drain();
         boot.on_sdo(3, &value(date));
-        if date == 7 {
-            assert_eq!(actions(&mut boot), read(0x1020, 2));
-            boot.on_sdo(4, &value(time));
-        }
+        assert_eq!(actions(&mut boot), read(0x1020, 2));
+        boot.on_sdo(4, &value(time));
+        let expected = (7, 8);
+        assert_eq!(boot.loaded(), loads.then_some(Loaded { had: Some((date, time)), expected }));
         let next = actions(&mut boot);
         assert_eq!(matches!(next[..], [Action::Write(_)]), loads, "{next:?}");
         if loads {
@@ -201,6 +201,24 @@ fn an_equal_configuration_date_skips_the_download() {
             boot.on_sdo(6, &SdoEnd::Written);
             assert_eq!(actions(&mut boot), [Action::StartErrorControl]);
         }
+    }
+}
+
+#[test]
+fn a_device_that_tells_no_configuration_date_is_loaded() {
+    let plan = Plan { identity: Identity::default(), config_stamp: Some((7, 8)), ..plan() };
+    for refused in [1, 2] {
+        let mut boot = Boot::new(plan.clone());
+        boot.start(0);
+        boot.on_sdo(1, &value(0));
+        boot.on_boot_up(2);
+        for _ in 1..refused {
+            boot.on_sdo(3, &value(7));
+        }
+        boot.drain();
+        boot.on_sdo(4, &SdoEnd::Abort(0x0602_0000));
+        assert_eq!(actions(&mut boot), [Action::Write(plan.writes[0].clone())]);
+        assert_eq!(boot.loaded(), Some(Loaded { had: None, expected: (7, 8) }));
     }
 }
 

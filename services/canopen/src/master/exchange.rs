@@ -36,8 +36,10 @@ struct Rx {
     bad: bool,
     /// Index of its queue, [`NONE`] for none.
     queue: u16,
-    /// SYNCs until its turn, for types above 1.
-    syncs_left: u8,
+    /// SYNCs until it is awaited.
+    syncs_left: u16,
+    /// One has come since its node became operational: its turns are known.
+    known: bool,
     deadline_ns: Option<u64>,
     poll_at_ns: Option<u64>,
 }
@@ -80,6 +82,8 @@ pub struct Exchange {
     latched: Vec<u8>,
     window_ns: u64,
     window_end_ns: Option<u64>,
+    /// Until then PDOs of the last SYNC may come, although its sample was complete without them.
+    late_until_ns: u64,
     /// With the index of the PDO in `rx`.
     queues: Vec<(usize, Queue)>,
     /// Fields are in the tail that were not published yet.
@@ -117,6 +121,16 @@ fn extend(value: u64, bits: u16) -> u64 {
     (((value << unused) as i64) >> unused) as u64
 }
 
+/// SYNCs until a PDO is awaited whose node has just become operational. A node counts from where it likes, so one of type
+/// n comes at the n-th SYNC or the one behind it; a node with a SYNC start value (sub-index 6 of its communication
+/// parameters) first waits for that value of the counter, 240 SYNCs at most (CiA 301 V4.2, clause 7.5.2.22).
+fn first_turn(transmission: u8) -> u16 {
+    match transmission {
+        0 | 1 => 1,
+        n => u16::from(n) + 1 + u16::from(transmission::CYCLIC_MAX),
+    }
+}
+
 impl Exchange {
     /// `window_ns`: time after a SYNC in which PDOs belong to it.
     pub fn new(plan: Plan, window_ns: u64) -> Self {
@@ -147,6 +161,7 @@ impl Exchange {
             bad: false,
             queue: queue_of(i).map_or(NONE, |queue| queue as u16),
             syncs_left: 1,
+            known: false,
             deadline_ns: None,
             poll_at_ns: None,
         });
@@ -172,6 +187,7 @@ impl Exchange {
             latched: vec![0; plan.output_bytes],
             window_ns,
             window_end_ns: None,
+            late_until_ns: 0,
             queues: plan.queues.iter().map(|&(i, size)| (usize::from(i), Queue::new(size.into()))).collect(),
             dirty: false,
             samples_due: 0,
@@ -263,7 +279,8 @@ impl Exchange {
                 continue;
             }
             let rx = &mut self.rx[i];
-            (rx.fresh, rx.expected, rx.syncs_left) = (false, false, 1);
+            (rx.fresh, rx.expected, rx.known) = (false, false, false);
+            rx.syncs_left = first_turn(rx.pdo.transmission);
             rx.deadline_ns = rx.pdo.deadline_ns.filter(|_| on).map(|d| now_ns.saturating_add(d));
             rx.poll_at_ns = rx.pdo.poll_ns.filter(|_| on).map(|_| now_ns);
             if !on {
@@ -384,17 +401,23 @@ impl Exchange {
         }
         let rx = &mut self.rx[i];
         if transmission::is_synchronous(rx.pdo.transmission) {
+            rx.known = true;
+            if !rx.expected {
+                // Which SYNCs are its turn is learned from the PDO itself.
+                rx.syncs_left = rx.pdo.transmission.max(1).into();
+            }
             if self.window_end_ns.is_none_or(|end_ns| t_ns > end_ns) {
-                self.counters.outside_window += 1;
+                // Of the SYNC whose sample did not wait for it.
+                let late = rx.pdo.transmission != 1 && t_ns <= self.late_until_ns;
                 // Type 0 tells of an event that may not be lost; a cyclic one comes again.
-                if rx.pdo.transmission == transmission::ACYCLIC && !queued {
+                if (late || rx.pdo.transmission == transmission::ACYCLIC) && !queued {
                     self.accept(i);
                 }
+                self.counters.outside_window += u64::from(!late);
                 return true;
             }
             rx.fresh = !queued;
             if std::mem::take(&mut rx.expected) && self.rx.iter().all(|rx| !rx.expected) {
-                self.counters.complete_samples += 1;
                 self.close_window();
             }
         } else if !queued {
@@ -406,6 +429,11 @@ impl Exchange {
     /// Everything of this SYNC is in, or will not come.
     fn close_window(&mut self) {
         self.window_end_ns = None;
+        if self.rx.iter().any(|rx| rx.expected) {
+            self.counters.incomplete_samples += 1;
+        } else {
+            self.counters.complete_samples += 1;
+        }
         for i in 0..self.rx.len() {
             if std::mem::take(&mut self.rx[i].expected) {
                 self.spoil(i, Quality::Stale);
@@ -420,27 +448,32 @@ impl Exchange {
     /// The master's SYNC came back from the bus: what follows belongs to it.
     pub fn on_sync(&mut self, t_ns: u64) {
         if self.window_end_ns.is_some() {
-            self.counters.incomplete_samples += 1;
             self.close_window();
         }
-        let mut any = false;
+        let (mut any, mut open) = (false, false);
         for rx in &mut self.rx {
-            if !transmission::is_synchronous(rx.pdo.transmission)
-                || !self.operational[usize::from(rx.pdo.node & 0x7F)]
-            {
+            let kind = rx.pdo.transmission;
+            if !transmission::is_synchronous(kind) || !self.operational[usize::from(rx.pdo.node & 0x7F)] {
                 continue;
             }
             any = true;
             rx.fresh = false;
             rx.syncs_left = rx.syncs_left.saturating_sub(1);
-            rx.expected = rx.pdo.transmission != transmission::ACYCLIC && rx.syncs_left == 0;
-            if rx.syncs_left == 0 {
-                rx.syncs_left = rx.pdo.transmission.max(1);
+            let turn = rx.syncs_left == 0;
+            if turn {
+                rx.syncs_left = kind.max(1).into();
             }
+            let acyclic = kind == transmission::ACYCLIC;
+            rx.expected = turn && !acyclic;
+            // It may come, and belongs to the sample if it does. A queue is no part of one.
+            let possible = (acyclic || !rx.known) && rx.queue == NONE;
+            open |= rx.expected || possible;
         }
-        self.window_end_ns = any.then(|| t_ns.saturating_add(self.window_ns));
-        if !any {
+        self.late_until_ns = t_ns.saturating_add(self.window_ns);
+        self.window_end_ns = open.then_some(self.late_until_ns);
+        if !open {
             self.samples_due += 1;
+            self.counters.complete_samples += u64::from(any);
         }
     }
 
@@ -500,7 +533,6 @@ impl Exchange {
     /// Sends what is due, closes a window that is over, finds what is stale.
     pub fn on_time(&mut self, now_ns: u64, out: &mut Outbox) {
         if self.window_end_ns.is_some_and(|end_ns| now_ns >= end_ns) {
-            self.counters.incomplete_samples += 1;
             self.close_window();
         }
         for tx in &mut self.tx {

@@ -359,6 +359,161 @@ fn every_sync_counts_once_even_when_two_are_published_together() {
     assert_eq!((exchange.take_sample(), exchange.samples()), (None, 3));
 }
 
+/// Which of three SYNCs a node takes for its third is its own affair: it is learned from its PDOs.
+#[test]
+fn a_node_counts_syncs_from_where_it_likes() {
+    for phase in 0..3u8 {
+        let plan = Plan {
+            rx: vec![
+                rx(0x182, 2, 1, vec![field(0, 8, 0, 1, 0)]),
+                rx(0x183, 3, 3, vec![field(0, 8, 1, 1, 1)]),
+            ],
+            input_bytes: vec![1, 1],
+            ..Plan::default()
+        };
+        let mut exchange = Exchange::new(plan, 10 * MS);
+        for node in [2, 3] {
+            exchange.set_operational(node, true, 0);
+        }
+        for sync in 0..30u8 {
+            let t_ns = u64::from(sync) * 10 * MS;
+            exchange.on_sync(t_ns);
+            // The node whose PDO comes at every SYNC is the first.
+            exchange.on_frame(t_ns + MS, &CanFrame::classic(0x182, &[sync]));
+            if sync % 3 == phase {
+                exchange.on_frame(t_ns + 2 * MS, &CanFrame::classic(0x183, &[sync]));
+            }
+            if sync >= 6 {
+                let third = sync - (sync + 3 - phase) % 3;
+                assert_eq!(exchange.tail(), [sync, third, 0, 0], "phase {phase}, SYNC {sync}");
+            }
+        }
+        let counters = exchange.counters();
+        assert!(counters.stale == 0 && counters.incomplete_samples == 0, "phase {phase}: {counters:?}");
+    }
+}
+
+/// A PDO of type 3 and one of type 1 that is always in first.
+fn by_threes() -> Exchange {
+    let plan = Plan {
+        rx: vec![rx(0x182, 2, 1, vec![field(0, 8, 0, 1, 0)]), rx(0x183, 3, 3, vec![field(0, 8, 1, 1, 1)])],
+        input_bytes: vec![1, 1],
+        ..Plan::default()
+    };
+    let mut exchange = Exchange::new(plan, 5 * MS);
+    exchange.set_operational(2, true, 0);
+    exchange.set_operational(3, true, 0);
+    exchange
+}
+
+/// A SYNC with the PDO of type 1, and the other one if it comes; then the end of the window.
+fn turn(exchange: &mut Exchange, sync: u8, comes: bool) {
+    let t_ns = u64::from(sync) * 10 * MS;
+    exchange.on_sync(t_ns);
+    exchange.on_frame(t_ns + 1, &CanFrame::classic(0x182, &[sync]));
+    if comes {
+        exchange.on_frame(t_ns + 2, &CanFrame::classic(0x183, &[sync]));
+    }
+    exchange.on_time(t_ns + 5 * MS, &mut Outbox::default());
+    assert!(exchange.take_sample().unwrap().sync);
+}
+
+#[test]
+fn a_turn_that_is_missed_is_stale_once_and_turns_are_learned_again() {
+    let mut exchange = by_threes();
+    let told = |exchange: &Exchange| (exchange.counters().stale, exchange.counters().incomplete_samples);
+    for sync in 0..=3 {
+        turn(&mut exchange, sync, sync % 3 == 0);
+    }
+    assert_eq!((exchange.tail(), told(&exchange)), (&[3, 3, 0, 0][..], (0, 0)));
+    // One is lost, the next comes in its turn.
+    for sync in 4..=8 {
+        turn(&mut exchange, sync, false);
+        assert_eq!(exchange.tail(), [sync, 3, 0, u8::from(sync >= 6)]);
+    }
+    turn(&mut exchange, 9, true);
+    assert_eq!((exchange.tail(), told(&exchange)), (&[9, 9, 0, 0][..], (1, 1)));
+    // The node missed a SYNC: late by one for once, then again at every third.
+    for sync in 10..=30 {
+        turn(&mut exchange, sync, sync % 3 == 1 && sync > 10);
+    }
+    assert_eq!((exchange.tail(), told(&exchange)), (&[30, 28, 0, 0][..], (2, 2)));
+    // It starts anew, and counts from elsewhere.
+    exchange.set_operational(3, false, 305 * MS);
+    exchange.set_operational(3, true, 306 * MS);
+    for sync in 31..=50 {
+        turn(&mut exchange, sync, sync % 3 == 0 && sync > 35);
+    }
+    assert_eq!((exchange.tail(), told(&exchange)), (&[50, 48, 0, 0][..], (3, 2)));
+    assert_eq!(exchange.counters().outside_window, 0);
+    assert_eq!(exchange.samples(), 51);
+}
+
+/// It may wait for its start value of the SYNC counter, a whole turn of that; but not for ever.
+#[test]
+fn a_pdo_that_never_comes_is_missed_at_last() {
+    let mut exchange = by_threes();
+    for sync in 0..=254 {
+        turn(&mut exchange, sync, false);
+        let missed = (u64::from(sync) + 1).saturating_sub(241) / 3;
+        assert_eq!(exchange.counters().incomplete_samples, missed, "SYNC {sync}");
+    }
+    assert_eq!(exchange.tail(), [254, 0, 0, Quality::NoData as u8]);
+}
+
+/// Type 0 comes with a change: it is collected when it comes, and nothing is missing when it does not.
+#[test]
+fn a_pdo_that_comes_with_a_change_is_never_missing() {
+    let acyclic = |cob_id, node, at: u32| rx(cob_id, node, 0, vec![field(0, 8, at, 1, at as u16)]);
+    let plan = Plan {
+        rx: vec![acyclic(0x181, 1, 0), acyclic(0x182, 2, 1), rx(0x183, 3, 1, vec![field(0, 8, 2, 1, 2)])],
+        input_bytes: vec![1, 1, 1],
+        ..Plan::default()
+    };
+    let mut exchange = Exchange::new(plan, 5 * MS);
+    let mut out = Outbox::default();
+    exchange.set_operational(1, true, 0);
+    exchange.set_operational(2, true, 0);
+    // Nothing changed.
+    exchange.on_sync(10 * MS);
+    exchange.on_time(15 * MS, &mut out);
+    assert_eq!(exchange.take_sample(), Some(Sample { sync: true }));
+    // Both changed: one sample.
+    exchange.on_sync(20 * MS);
+    for id in [0x181, 0x182] {
+        exchange.on_frame(20 * MS + 1, &CanFrame::classic(id, &[2]));
+        assert_eq!(exchange.take_sample(), None);
+    }
+    exchange.on_sync(30 * MS);
+    assert_eq!(
+        (exchange.take_sample(), exchange.tail()),
+        (Some(Sample { sync: true }), &[2, 2, 0, 0, 0, 2][..])
+    );
+    exchange.on_time(35 * MS, &mut out);
+    assert_eq!(exchange.take_sample(), Some(Sample { sync: true }));
+    // The sample does not wait for them when all is in that was due; what comes then is shown at once.
+    exchange.set_operational(3, true, 36 * MS);
+    exchange.on_sync(40 * MS);
+    exchange.on_frame(40 * MS + 1, &CanFrame::classic(0x183, &[4]));
+    assert_eq!(exchange.take_sample(), Some(Sample { sync: true }));
+    exchange.on_frame(40 * MS + 2, &CanFrame::classic(0x181, &[4]));
+    assert_eq!(
+        (exchange.take_sample(), exchange.tail()),
+        (Some(Sample { sync: false }), &[4, 2, 4, 0, 0, 0][..])
+    );
+    let counters = exchange.counters();
+    assert_eq!((counters.complete_samples, counters.incomplete_samples), (4, 0));
+    assert_eq!((counters.outside_window, counters.stale), (0, 0));
+    // Without the one that is due it is incomplete.
+    exchange.on_sync(50 * MS);
+    exchange.on_frame(50 * MS + 1, &CanFrame::classic(0x181, &[5]));
+    exchange.on_time(55 * MS, &mut out);
+    assert_eq!(exchange.counters().incomplete_samples, 1);
+    // Behind the window: shown all the same, and counted.
+    exchange.on_frame(56 * MS, &CanFrame::classic(0x182, &[5]));
+    assert_eq!((exchange.tail(), exchange.counters().outside_window), (&[5, 5, 4, 0, 0, 1][..], 1));
+}
+
 proptest! {
     #[test]
     fn bits_round_trip(data in any::<[u8; 8]>(), first in 0u16..80, bits in 1u16..70, value: u64) {

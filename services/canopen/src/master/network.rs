@@ -307,7 +307,8 @@ impl Network {
                 node.booted_ns = Some((now_ns, now_ns.saturating_sub(node.boot.began_ns())));
                 (node.kept, node.last_failure) = (kept, None);
                 self.nodes[i].told_duplicate = false;
-                self.tell(Event::Booted { node: id, attempts, kept });
+                let loaded = self.nodes[i].boot.loaded();
+                self.tell(Event::Booted { node: id, attempts, kept, loaded });
                 self.booted(now_ns, i, kept);
             }
             Action::Failed(failure) => {

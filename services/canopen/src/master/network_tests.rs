@@ -115,8 +115,8 @@ fn a_network_boots_and_exchanges() {
     bus.start();
     bus.run(200);
     insta::assert_snapshot!(bus.said(), @r"
-    Booted { node: 2, attempts: 1, kept: false }
-    Booted { node: 3, attempts: 1, kept: false }
+    Booted { node: 2, attempts: 1, kept: false, loaded: None }
+    Booted { node: 3, attempts: 1, kept: false, loaded: None }
     NetworkStarted
     ");
     assert!(bus.network.nodes().iter().all(NodeRun::is_operational));
@@ -183,8 +183,8 @@ fn a_takeover_disturbs_no_running_node() {
     second.start();
     second.run(500);
     let told = second.said();
-    assert!(told.contains("Booted { node: 2, attempts: 1, kept: true }"), "{told}");
-    assert!(told.contains("Booted { node: 3, attempts: 1, kept: false }"), "{told}");
+    assert!(told.contains("Booted { node: 2, attempts: 1, kept: true, loaded: None }"), "{told}");
+    assert!(told.contains("Booted { node: 3, attempts: 1, kept: false, loaded: None }"), "{told}");
     assert_eq!(second.slaves[0].resets, resets[0]);
     assert_eq!(second.slaves[1].resets, resets[1] + 1);
     assert!(second.network.nodes().iter().all(NodeRun::is_operational));

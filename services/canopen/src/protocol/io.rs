@@ -36,6 +36,10 @@ impl Outbox {
     pub fn drain(&mut self) -> impl Iterator<Item = CanFrame> + '_ {
         self.frames.drain(..)
     }
+    /// Takes the first `n` frames, or as many as there are.
+    pub fn drain_first(&mut self, n: usize) -> impl Iterator<Item = CanFrame> + '_ {
+        self.frames.drain(..n.min(self.frames.len()))
+    }
     /// Takes frames out again that shall not be sent after all.
     pub fn retain(&mut self, keep: impl FnMut(&CanFrame) -> bool) {
         self.frames.retain(keep);

@@ -72,7 +72,7 @@ impl Player {
 
     fn send(&mut self) -> Result<(), SendError> {
         self.queue.add(self.out.drain());
-        let handed = self.queue.send(clock::mono_ns(), &mut self.tx, |_| {});
+        let handed = self.queue.send(&mut self.tx, |_| {});
         self.dropped = self.queue.dropped();
         handed.map(|_| ())
     }

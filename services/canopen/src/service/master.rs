@@ -8,7 +8,7 @@ mod setup;
 pub use setup::{check, topics};
 
 use super::job_port::JobPort;
-use super::ports::Ports;
+use super::ports::{Ports, Search};
 use super::{EVENTS_A_SECOND, RunError, TAKE_FRAMES, load, plc_of};
 use crate::config::{MasterConfig as Config, OnStop, OnStopWord};
 use crate::master::exchange::Exchange;
@@ -24,7 +24,7 @@ use ipc_types::event::Budget;
 use ipc_types::inputs::InputsPort;
 use ipc_types::outputs::{Change, Guard, Words, gather};
 use ipc_types::payload::{CanFrame, HealthState, Inputs};
-use ipc_types::turns::Turns;
+use ipc_types::turns::{Turn, Turns};
 use ipc_types::wiring::ImageRange;
 use ipc_types::{Context, clock};
 use jobs::Desk;
@@ -46,7 +46,7 @@ pub fn run(mut ctx: Context) -> Result<(), RunError> {
         safe_values(&config, &plan.outputs).map_err(|(key, message)| RunError::Config { key, message })?;
     let ports = Ports::open(&mut ctx, &wiring, Guard::new(config.stale_after, &config.safe_on))?;
     let jobs = JobPort::open(&mut ctx)?;
-    let turns = Turns::new(ctx.inbox()?, ctx.shutdown_fd())?;
+    let mut turns = Turns::new(ctx.inbox()?, ctx.shutdown_fd())?;
     plan.settings.takeover = ctx.generation > 1;
     let Plan { settings, sync_window_ns, nodes, exchange, outputs, .. } = plan;
     let transfers = Transfers::new(config.nodes.iter().map(|node| {
@@ -75,6 +75,10 @@ pub fn run(mut ctx: Context) -> Result<(), RunError> {
         events: Budget::new(EVENTS_A_SECOND),
         sync_out_ns: (0, 0),
     };
+    service.introduce();
+    if !service.await_driver(&mut turns)? {
+        return Ok(());
+    }
     service.begin();
     service.work(turns)
 }
@@ -97,10 +101,45 @@ struct Service {
 }
 
 impl Service {
-    fn begin(&mut self) {
+    fn introduce(&mut self) {
         // Tells the plc that its inputs have no data yet, so that its first scan need not wait.
         self.publish(true);
         self.ctx.ready();
+        self.status();
+    }
+
+    /// Until the driver of the bus is there; false: the service shall end.
+    fn await_driver(&mut self, turns: &mut Turns) -> Result<bool, RunError> {
+        let mut search = Search::new(clock::mono_ns());
+        loop {
+            let now_ns = clock::mono_ns();
+            if self.ports.find_driver(&mut search, now_ns, &mut self.ctx) {
+                return Ok(true);
+            }
+            turns.come_again(search.next_ns(now_ns))?;
+            let due = turns.wait()?;
+            if due.stop {
+                return Ok(false);
+            }
+            turns.drain();
+            self.regular(due);
+        }
+    }
+
+    /// What comes with the heartbeat.
+    fn regular(&mut self, due: Turn) {
+        if due.beat {
+            self.ctx.beat();
+            if self.ports.inputs.is_due(clock::mono_ns()) {
+                self.publish(false);
+            }
+        }
+        if due.status {
+            self.status();
+        }
+    }
+
+    fn begin(&mut self) {
         let now_ns = clock::mono_ns();
         self.network.start(now_ns, &mut self.out);
         self.send();
@@ -126,15 +165,7 @@ impl Service {
             self.on_time();
             self.answer_jobs();
             self.tell_events();
-            if due.beat {
-                self.ctx.beat();
-                if self.ports.inputs.is_due(now_ns) {
-                    self.publish(false);
-                }
-            }
-            if due.status {
-                self.status();
-            }
+            self.regular(due);
             let next_ns = self.ports.next_ns(now_ns, more, self.network.next_deadline());
             turns.come_again(next_ns)?;
         }
@@ -165,7 +196,7 @@ impl Service {
     }
 
     fn send(&mut self) {
-        self.ports.send(&mut self.out, |_| {});
+        self.ports.send(self.out.drain(), |_| {});
     }
 
     /// Takes frames of the bus; true when more may wait.

@@ -1,9 +1,10 @@
 //! The service `canopen-slave`: rail ports, clocks, the loop.
 
+mod boot_up;
 mod jobs;
 
 use super::job_port::JobPort;
-use super::ports::Ports;
+use super::ports::{Ports, Search};
 use super::{EVENTS_A_SECOND, RunError, TAKE_FRAMES, addressing_near, load, plc_of};
 use crate::config::SlaveConfig as Config;
 use crate::device::Device;
@@ -18,6 +19,7 @@ use crate::protocol::node::{Node, NodeEvent, NodeParams};
 use crate::protocol::time_stamp::TimeOfDay;
 use crate::slave::image_map::{self, ImageMap};
 use crate::slave::{drop_synchronous, is_late_sync, simulation};
+use boot_up::BootUpFirst;
 use dinrail_iec::Addressing;
 use ipc_types::can_queue::Handed;
 use ipc_types::event::{Budget, EventKind, Level};
@@ -26,7 +28,7 @@ use ipc_types::payload::{CanFrame, Inputs, can_flag};
 use ipc_types::port::Subscriber;
 use ipc_types::stack::ServiceEntry;
 use ipc_types::topic::TopicKind;
-use ipc_types::turns::Turns;
+use ipc_types::turns::{Turn, Turns};
 use ipc_types::units::BitRate;
 use ipc_types::wiring::{Neighbours, TopicDecl};
 use ipc_types::{Context, Finding, Stack, Wiring, clock, plc_table};
@@ -183,11 +185,12 @@ pub fn run(mut ctx: Context) -> Result<(), RunError> {
     let guard = Guard::new(config.stale_after, &SafeOn::ALL);
     let ports = Ports::open(&mut ctx, &wiring, guard)?;
     let jobs = JobPort::open(&mut ctx)?;
-    let turns = Turns::new(ctx.inbox()?, ctx.shutdown_fd())?;
+    let mut turns = Turns::new(ctx.inbox()?, ctx.shutdown_fd())?;
     let mut service = Service {
         ctx,
         config,
         unechoed: 0,
+        first: BootUpFirst::default(),
         serial,
         node,
         gathered: vec![0; map.gathered_bytes()],
@@ -202,6 +205,10 @@ pub fn run(mut ctx: Context) -> Result<(), RunError> {
         data_t_ns: 0,
         events: Budget::new(EVENTS_A_SECOND),
     };
+    service.introduce();
+    if !service.await_driver(&mut turns)? {
+        return Ok(());
+    }
     service.begin();
     service.work(turns)
 }
@@ -211,6 +218,7 @@ struct Service {
     config: Config,
     /// Error control messages sent whose echo has not come.
     unechoed: u32,
+    first: BootUpFirst,
     /// Serial number, which a reset to defaults would lose.
     serial: Option<u32>,
     node: Node,
@@ -230,9 +238,44 @@ struct Service {
 }
 
 impl Service {
-    fn begin(&mut self) {
+    fn introduce(&mut self) {
         self.publish(true);
         self.ctx.ready();
+        self.status();
+    }
+
+    /// Until the driver of the bus is there; false: the service shall end.
+    fn await_driver(&mut self, turns: &mut Turns) -> Result<bool, RunError> {
+        let mut search = Search::new(clock::mono_ns());
+        loop {
+            let now_ns = clock::mono_ns();
+            if self.ports.find_driver(&mut search, now_ns, &mut self.ctx) {
+                return Ok(true);
+            }
+            turns.come_again(search.next_ns(now_ns))?;
+            let due = turns.wait()?;
+            if due.stop {
+                return Ok(false);
+            }
+            turns.drain();
+            self.regular(due);
+        }
+    }
+
+    /// What comes with the heartbeat.
+    fn regular(&mut self, due: Turn) {
+        if due.beat {
+            self.ctx.beat();
+            if self.ports.inputs.is_due(clock::mono_ns()) {
+                self.publish(false);
+            }
+        }
+        if due.status {
+            self.status();
+        }
+    }
+
+    fn begin(&mut self) {
         self.node.start(clock::mono_ns(), &mut self.out);
         self.after(clock::mono_ns());
         self.status();
@@ -253,16 +296,9 @@ impl Service {
             self.follow(change);
             self.node.on_time(now_ns, &mut self.out);
             self.after(now_ns);
-            if due.beat {
-                self.ctx.beat();
-                if self.ports.inputs.is_due(now_ns) {
-                    self.publish(false);
-                }
-            }
-            if due.status {
-                self.status();
-            }
-            let next_ns = self.ports.next_ns(now_ns, more, self.node.next_deadline());
+            self.regular(due);
+            let next_ns = self.node.next_deadline().into_iter().chain(self.first.next_ns()).min();
+            let next_ns = self.ports.next_ns(now_ns, more, next_ns);
             turns.come_again(next_ns)?;
         }
     }
@@ -297,6 +333,9 @@ impl Service {
             && frame.can_id == predefined::ERROR_CONTROL + u32::from(self.node.node_id())
             && self.unechoed > 0;
         self.unechoed -= u32::from(own);
+        if own && BootUpFirst::is_boot_up(frame, frame.can_id) {
+            self.first.done();
+        }
         own
     }
 
@@ -378,15 +417,18 @@ impl Service {
     }
 
     fn send(&mut self) {
-        if clock::mono_ns() < self.silent_until_ns {
+        let now_ns = clock::mono_ns();
+        if now_ns < self.silent_until_ns {
             self.out.drain().for_each(drop);
         }
         let own = predefined::ERROR_CONTROL + u32::from(self.node.node_id());
         let unechoed = &mut self.unechoed;
         let sent = |frame: &CanFrame| *unechoed += u32::from(frame.can_id == own);
-        if self.ports.send(&mut self.out, sent) == Handed::Dropped {
+        let ready = self.first.pass(now_ns, own, self.out.frames());
+        if self.ports.send(self.out.drain_first(ready), sent) == Handed::Dropped {
             // The driver is away, and with it the echoes it owes.
             self.unechoed = 0;
+            self.first.done();
         }
     }
 

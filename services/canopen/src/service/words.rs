@@ -1,6 +1,6 @@
 //! What the network did, in sentences for people.
 
-use crate::master::boot::Failure;
+use crate::master::boot::{Failure, Loaded};
 use crate::master::network::{Event, Sign, state_name};
 use crate::protocol::abort::Abort;
 use ipc_types::event::{EventKind, Level};
@@ -24,6 +24,18 @@ pub fn failure_text(failure: &Failure, object: impl Fn(u16, u8) -> String) -> St
     text
 }
 
+/// Why a configuration was loaded, behind "is booted".
+fn loaded_text(Loaded { had, expected: (date, time) }: Loaded) -> String {
+    let had = match had {
+        Some((0, 0)) => {
+            "it was never configured, or was changed since (date and time are 0 in 1020h)".to_owned()
+        }
+        Some((date, time)) => format!("it had date {date} and time {time} (1020h)"),
+        None => "it does not tell which one it has (1020h)".to_owned(),
+    };
+    format!("; its configuration was loaded: {had}, {date} and {time} are expected")
+}
+
 /// Kind, level, sentence and details of an event. `name` gives `node 5 (Test I/O)`.
 pub fn event(
     event: &Event,
@@ -32,12 +44,16 @@ pub fn event(
 ) -> (EventKind, Level, String, Value) {
     let node_state = EventKind::NodeState;
     match *event {
-        Event::Booted { node, attempts, kept } => {
+        Event::Booted { node, attempts, kept, loaded } => {
             let how = if kept { "was running already and is left running" } else { "is booted" };
             let tries = if attempts > 1 { format!(" at try {attempts}") } else { String::new() };
-            let detail =
+            let mut detail =
                 json!({ "node": node, "attempts": attempts, "kept": kept, "letter": kept.then_some("L") });
-            (node_state, Level::Info, format!("{} {how}{tries}", name(node)), detail)
+            if let Some(loaded) = loaded {
+                detail["loaded"] = json!(loaded);
+            }
+            let why = loaded.map(loaded_text).unwrap_or_default();
+            (node_state, Level::Info, format!("{} {how}{tries}{why}", name(node)), detail)
         }
         Event::BootFailed { node, failure } => {
             let text = format!("{}: {}", name(node), failure_text(&failure, object));
@@ -174,9 +190,16 @@ mod tests {
             abort: Some(0x0609_0030),
             ..failure
         };
+        let loaded = |attempts, had| {
+            let loaded = Some(Loaded { had, expected: (100, 200) });
+            Event::Booted { node: 5, attempts, kept: false, loaded }
+        };
         let all = [
-            Event::Booted { node: 5, attempts: 1, kept: false },
-            Event::Booted { node: 5, attempts: 3, kept: true },
+            Event::Booted { node: 5, attempts: 1, kept: false, loaded: None },
+            Event::Booted { node: 5, attempts: 3, kept: true, loaded: None },
+            loaded(2, Some((99, 200))),
+            loaded(1, Some((0, 0))),
+            loaded(1, None),
             Event::BootFailed { node: 5, failure },
             Event::BootFailed { node: 5, failure: refused },
             Event::BootFailed { node: 5, failure: Failure { abort: None, ..refused } },

@@ -13,7 +13,7 @@ impl Engine {
         self.writer.begin();
     }
 
-    /// Applies a command. A force beyond [`MAX_FORCES`] is ignored: ask [`Self::can_force`] first.
+    /// Applies a command. A force beyond [`MAX_FORCES`] is ignored: whoever hands it in counts first.
     pub fn control(&mut self, source: &Source, command: &Command<'_>) {
         self.writer.control(source, command);
         match command {
@@ -45,11 +45,6 @@ impl Engine {
             }
             Command::Load { .. } => {}
         }
-    }
-
-    /// Whether there is room for one more force at this place.
-    pub fn can_force(&self, patch: &Patch) -> bool {
-        self.forces.len() < MAX_FORCES || self.forces.iter().any(|f| f.same_place(patch))
     }
 
     fn force(&mut self, patch: &Patch, path: &str) {

@@ -38,7 +38,10 @@ pub fn read_file(path: &Path) -> Option<Kept> {
 
 /// Writes whole or not at all: beside it, fsync, rename, fsync of the folder.
 fn write_file(path: &Path, kept: &Kept) -> io::Result<()> {
-    let aside = path.with_extension("new");
+    // The whole name: `keep.1` and `keep.2` of two engines must not share the file beside them.
+    let mut aside = path.as_os_str().to_owned();
+    aside.push(".new");
+    let aside = PathBuf::from(aside);
     let mut file = File::create(&aside)?;
     file.write_all(&header(kept.seq, kept.layout, kept.plc_time_ns, &kept.bytes))?;
     file.write_all(&kept.bytes)?;
@@ -87,15 +90,18 @@ impl Drop for DiskCopy {
 
 fn copy_loop(fd: &OwnedFd, path: &Path, stop: &AtomicBool, failures: &AtomicU64) {
     let mut memory = vec![0u8; MEMORY_BYTES];
-    let mut written: Option<(u64, Vec<u8>)> = None;
+    let mut written: Option<Kept> = None;
     loop {
         let last = stop.load(Ordering::Acquire);
         // A commit may be under way: then one slot is torn, the other one is whole.
         if let Some(kept) = read_memory(fd, &mut memory)
-            && written.as_ref().is_none_or(|(layout, bytes)| *layout != kept.layout || *bytes != kept.bytes)
+            && written.as_ref().is_none_or(|w| {
+                // At the end also for the PLC's time alone, which goes on from there.
+                (w.layout, &w.bytes) != (kept.layout, &kept.bytes) || last && w.seq != kept.seq
+            })
         {
             match write_file(path, &kept) {
-                Ok(()) => written = Some((kept.layout, kept.bytes)),
+                Ok(()) => written = Some(kept),
                 Err(e) => {
                     if failures.fetch_add(1, Ordering::Relaxed).is_multiple_of(120) {
                         tracing::error!("retain file {} cannot be written: {e}", path.display());

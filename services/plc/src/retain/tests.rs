@@ -63,9 +63,31 @@ fn the_disk_gets_the_newest_state_and_gives_it_back() {
         std::thread::sleep(Duration::from_millis(20));
     }
     committer.commit(map.bytes_mut(), 5, 2, b"two");
+    while read_file(&path).is_none_or(|kept| kept.bytes != b"two") {
+        assert!(Instant::now() < limit, "the second change never reached the disk");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    // Only the PLC's time went on.
+    committer.commit(map.bytes_mut(), 5, 9, b"two");
     drop(copy);
-    assert_eq!(read_file(&path).unwrap().bytes, b"two");
+    let kept = read_file(&path).unwrap();
+    assert_eq!((kept.plc_time_ns, kept.bytes), (9, b"two".to_vec()));
     std::fs::write(&path, b"rubbish").unwrap();
     assert_eq!(read_file(&path), None);
+    std::fs::remove_dir_all(&dir).unwrap();
+}
+
+#[test]
+fn engines_whose_files_differ_in_the_last_part_only_do_not_meet() {
+    let dir = std::env::temp_dir().join(format!("dinrail-retain-aside-{}", std::process::id()));
+    // What stands in the way of one file's neighbour must not hinder the other file.
+    std::fs::create_dir_all(dir.join("keep.new")).unwrap();
+    let fd = rustix::fs::memfd_create("retain-test", rustix::fs::MemfdFlags::CLOEXEC).unwrap();
+    rustix::fs::ftruncate(&fd, MEMORY_BYTES as u64).unwrap();
+    let mut map = Mapping::new(&fd, MEMORY_BYTES).unwrap();
+    let mut committer = Committer::new(map.bytes());
+    committer.commit(map.bytes_mut(), 5, 1, b"one");
+    drop(DiskCopy::start(fd, dir.join("keep.1")).unwrap());
+    assert_eq!(read_file(&dir.join("keep.1")).map(|kept| kept.bytes), Some(b"one".to_vec()));
     std::fs::remove_dir_all(&dir).unwrap();
 }

@@ -3,12 +3,18 @@
 use crate::engine::Engine;
 use dinrail_iec::artifact::{ElemType, Symbol};
 use ipc_types::payload::PlcState;
-use ipc_types::scan_record::{Command, Patch, Source, Start};
+use ipc_types::scan_record::{Command, MAX_FORCES, Patch, Source, Start};
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
 
 /// Most variables of one `read`.
 const MAX_READ: usize = 256;
+/// Most variables of one `write` or `force`.
+pub const MAX_SET: usize = 64;
+/// Most commands that wait for a scan.
+pub(super) const MAX_ORDERS: usize = 2 * MAX_SET;
+/// Wrong assignments that a refusal names.
+const MAX_TOLD: usize = 8;
 /// Most elements of an array that `read` shows.
 const MAX_ELEMENTS: u64 = 64;
 
@@ -48,8 +54,8 @@ pub(super) struct Asker {
 /// What a job asks for.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Request {
-    /// Applied in the next scan, answered after it.
-    Order(Order),
+    /// Applied in the next scan, all of them, answered after it.
+    Orders(Vec<Order>),
     /// Answered at once.
     Answer(Value),
     Status,
@@ -66,16 +72,17 @@ pub(super) type Refusal = (u32, String);
 const FAILED: u32 = 1;
 const NOT_SUPPORTED: u32 = 3;
 
-/// Reads a job.
-pub(super) fn parse(tail: &[u8], engine: &Engine) -> Result<Request, Refusal> {
+/// Reads a job. `waiting` are the commands that the next scan applies before it.
+pub(super) fn parse(tail: &[u8], engine: &Engine, waiting: &[(Source, Order)]) -> Result<Request, Refusal> {
     let fail = |text: String| (FAILED, text);
     let job: Value = serde_json::from_slice(tail).map_err(|e| fail(format!("the job is no JSON: {e}")))?;
     let text = |key: &str| {
         job.get(key).and_then(Value::as_str).ok_or_else(|| fail(format!("the job lacks \"{key}\" (a text)")))
     };
-    let start = |kind| Ok(Request::Order(Order::Start(kind)));
+    let one = |order| Ok(Request::Orders(vec![order]));
+    let start = |kind| one(Order::Start(kind));
     match text("do")? {
-        "stop" => Ok(Request::Order(Order::Stop)),
+        "stop" => one(Order::Stop),
         "run" => match engine.state() {
             PlcState::Fault => start(Start::Warm),
             PlcState::Run => Ok(Request::Answer(json!(true))),
@@ -85,15 +92,18 @@ pub(super) fn parse(tail: &[u8], engine: &Engine) -> Result<Request, Refusal> {
         "warm" => start(Start::Warm),
         "hot" => start(Start::Hot),
         "force" => {
-            let (patch, path) = assignment(&job, engine)?;
-            if !engine.can_force(&patch) {
-                return Err(fail("all 256 forces are in use; unforce some first".to_owned()));
+            let list = assignments(&job, engine)?;
+            if !have_room(engine, waiting, &list) {
+                return Err(fail(format!(
+                    "more than {MAX_FORCES} forces are not possible; unforce some first"
+                )));
             }
-            Ok(Request::Order(Order::Force(patch, path)))
+            let order = |(patch, path)| Order::Force(patch, path);
+            Ok(Request::Orders(list.into_iter().map(order).collect()))
         }
         "write" => {
-            let (patch, path) = assignment(&job, engine)?;
-            Ok(Request::Order(Order::Set(patch, path)))
+            let order = |(patch, path)| Order::Set(patch, path);
+            Ok(Request::Orders(assignments(&job, engine)?.into_iter().map(order).collect()))
         }
         "unforce" => {
             let path = text("var")?;
@@ -103,9 +113,9 @@ pub(super) fn parse(tail: &[u8], engine: &Engine) -> Result<Request, Refusal> {
                     || (patch.offset == cell.offset && u32::from(patch.len) == cell.bytes())
             });
             let Some((name, patch)) = found else { return Err(fail(format!("'{path}' is not forced"))) };
-            Ok(Request::Order(Order::Unforce(*patch, name.to_owned())))
+            one(Order::Unforce(*patch, name.to_owned()))
         }
-        "unforce_all" => Ok(Request::Order(Order::UnforceAll)),
+        "unforce_all" => one(Order::UnforceAll),
         "read" => read(&job, engine).map(Request::Answer).map_err(fail),
         "status" => Ok(Request::Status),
         "keyframe" => Ok(Request::Keyframe),
@@ -120,14 +130,60 @@ pub(super) fn parse(tail: &[u8], engine: &Engine) -> Result<Request, Refusal> {
     }
 }
 
-fn assignment(job: &Value, engine: &Engine) -> Result<(Patch, String), Refusal> {
+/// `var` and `value`, or `set` = a list of them: all, or none when one is wrong.
+fn assignments(job: &Value, engine: &Engine) -> Result<Vec<(Patch, String)>, Refusal> {
     let fail = |text: String| (FAILED, text);
-    let path =
-        job.get("var").and_then(Value::as_str).ok_or_else(|| fail("the job lacks \"var\"".to_owned()))?;
-    let value = job.get("value").ok_or_else(|| fail("the job lacks \"value\"".to_owned()))?;
-    let cell = engine.resolve(path).map_err(|e| fail(e.to_string()))?;
-    let patch = cell.patch(path, value).map_err(|e| fail(e.to_string()))?;
+    let Some(list) = job.get("set") else {
+        return Ok(vec![assignment(job, engine).map_err(fail)?]);
+    };
+    let list = list.as_array().ok_or_else(|| fail("\"set\" is no list of var and value".to_owned()))?;
+    if list.is_empty() || list.len() > MAX_SET {
+        return Err(fail(format!("{} variables in one job; 1 to {MAX_SET} are possible", list.len())));
+    }
+    let (mut good, mut wrong) = (Vec::with_capacity(list.len()), Vec::new());
+    for one in list {
+        match assignment(one, engine) {
+            Ok(found) => good.push(found),
+            Err(text) => wrong.push(text),
+        }
+    }
+    if wrong.is_empty() {
+        return Ok(good);
+    }
+    let more = wrong.len().saturating_sub(MAX_TOLD);
+    wrong.truncate(MAX_TOLD);
+    let more = if more > 0 { format!("; and {more} more") } else { String::new() };
+    Err(fail(format!("{}{more}", wrong.join("; "))))
+}
+
+fn assignment(job: &Value, engine: &Engine) -> Result<(Patch, String), String> {
+    let path = job.get("var").and_then(Value::as_str).ok_or("the job lacks \"var\"")?;
+    let value = job.get("value").ok_or("the job lacks \"value\"")?;
+    let cell = engine.resolve(path).map_err(|e| e.to_string())?;
+    let patch = cell.patch(path, value).map_err(|e| e.to_string())?;
     Ok((patch, path.to_owned()))
+}
+
+/// Whether these can be forced once the commands that wait are applied.
+fn have_room(engine: &Engine, waiting: &[(Source, Order)], list: &[(Patch, String)]) -> bool {
+    let mut forced: Vec<Patch> = engine.forces().map(|(_, patch)| *patch).collect();
+    let force = |forced: &mut Vec<Patch>, patch: &Patch| {
+        if !forced.iter().any(|f| f.same_place(patch)) {
+            forced.push(*patch);
+        }
+    };
+    for (_, order) in waiting {
+        match order {
+            Order::Force(patch, _) => force(&mut forced, patch),
+            Order::Unforce(patch, _) => forced.retain(|f| !f.same_place(patch)),
+            Order::UnforceAll => forced.clear(),
+            Order::Stop | Order::Start(_) | Order::Set(..) | Order::Load(_) => {}
+        }
+    }
+    for (patch, _) in list {
+        force(&mut forced, patch);
+    }
+    forced.len() <= MAX_FORCES
 }
 
 /// `var`: `{value, type}`; `vars`: `{name: value}`.
@@ -168,4 +224,103 @@ fn elements(array: &Symbol, engine: &Engine) -> Value {
                 .json(engine.memory())
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::{Engine, Runtime, Stamps};
+    use crate::program::compile_sources;
+    use crate::setup::Setup;
+    use std::sync::Arc;
+
+    fn engine(text: &str) -> Engine {
+        let sources = vec![dinrail_iec::Source { name: "main.st".into(), text: text.into() }];
+        let program = compile_sources(sources, &Setup::default()).unwrap_or_else(|e| panic!("{e}")).program;
+        let mut engine =
+            Engine::new(&Runtime::new().unwrap(), Some(program), Arc::new(Setup::default())).unwrap();
+        engine.begin(Stamps::default());
+        engine.control(&Source::default(), &Command::Start(Start::Cold));
+        engine.finish();
+        engine
+    }
+
+    fn orders(engine: &Engine, job: &Value) -> Result<Vec<Order>, String> {
+        match parse(&serde_json::to_vec(job).unwrap(), engine, &[]) {
+            Ok(Request::Orders(orders)) => Ok(orders),
+            Ok(other) => panic!("{other:?}"),
+            Err((_, text)) => Err(text),
+        }
+    }
+
+    const TWO: &str = "PROGRAM main VAR a, b : INT; c : BOOL; END_VAR END_PROGRAM";
+
+    #[test]
+    fn a_list_is_written_whole_or_refused_whole() {
+        let engine = engine(TWO);
+        let list = json!([{ "var": "a", "value": 1 }, { "var": "main.b", "value": -2 }, { "var": "%MW3", "value": 9 }]);
+        let found = orders(&engine, &json!({ "do": "write", "set": list })).unwrap();
+        let paths: Vec<&str> = found
+            .iter()
+            .map(|order| match order {
+                Order::Set(_, path) => path.as_str(),
+                other => panic!("{other:?}"),
+            })
+            .collect();
+        assert_eq!(paths, ["a", "main.b", "%MW3"]);
+        let forced = orders(&engine, &json!({ "do": "force", "set": list })).unwrap();
+        assert!(forced.iter().all(|order| matches!(order, Order::Force(..))) && forced.len() == 3);
+        assert_eq!(orders(&engine, &json!({ "do": "write", "var": "a", "value": 1 })).unwrap().len(), 1);
+
+        let many: Vec<Value> = (0..=MAX_SET).map(|_| json!({ "var": "a", "value": 1 })).collect();
+        for (set, said) in [
+            (
+                json!([{ "var": "a", "value": 1 }, { "var": "c", "value": 2 }, { "var": "d", "value": 0 }]),
+                "'c' is BOOL; 2 does not fit: give true or false; no variable 'd'",
+            ),
+            (json!([{ "var": "a", "value": 1 }, { "var": "b" }]), "the job lacks \"value\""),
+            (json!([]), "0 variables in one job; 1 to 64 are possible"),
+            (json!(many), "65 variables in one job; 1 to 64 are possible"),
+            (json!({ "a": 1 }), "\"set\" is no list of var and value"),
+        ] {
+            assert_eq!(orders(&engine, &json!({ "do": "write", "set": set })).unwrap_err(), said);
+        }
+        let wrong: Vec<Value> = (0..20).map(|i| json!({ "var": format!("x{i}"), "value": 1 })).collect();
+        let said = orders(&engine, &json!({ "do": "write", "set": wrong })).unwrap_err();
+        assert!(said.ends_with("no variable 'x7'; and 12 more"), "{said}");
+    }
+
+    #[test]
+    fn forces_that_wait_for_the_scan_count_too() {
+        let mut engine = engine(TWO);
+        let bit = |n: usize| format!("%MX{}.{}", n / 8, n % 8);
+        engine.begin(Stamps::default());
+        for n in 0..MAX_FORCES - 1 {
+            let path = bit(n);
+            let patch = engine.resolve(&path).unwrap().patch(&path, &json!(true)).unwrap();
+            engine.control(&Source::default(), &Command::Force { patch, path: &path });
+        }
+        engine.finish();
+        let force = |n: usize, waiting: &[(Source, Order)]| {
+            parse(
+                json!({ "do": "force", "var": bit(n), "value": true }).to_string().as_bytes(),
+                &engine,
+                waiting,
+            )
+        };
+        let Ok(Request::Orders(last)) = force(MAX_FORCES, &[]) else { panic!("there is room for one") };
+        let mut waiting = vec![(Source::default(), last[0].clone())];
+        let (_, said) = force(MAX_FORCES + 1, &waiting).unwrap_err();
+        assert_eq!(said, "more than 256 forces are not possible; unforce some first");
+        assert!(
+            force(MAX_FORCES, &waiting).is_ok() && force(3, &waiting).is_ok(),
+            "these places are forced already"
+        );
+        waiting.push((Source::default(), Order::UnforceAll));
+        assert!(force(MAX_FORCES + 1, &waiting).is_ok());
+        let two = json!([{ "var": bit(300), "value": true }, { "var": bit(301), "value": true }]);
+        let (_, said) =
+            parse(json!({ "do": "force", "set": two }).to_string().as_bytes(), &engine, &[]).unwrap_err();
+        assert!(said.starts_with("more than 256"), "{said}");
+    }
 }

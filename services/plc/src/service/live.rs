@@ -6,7 +6,7 @@ mod tell;
 
 use super::acks::Acks;
 use super::inputs::InputSource;
-use super::jobs::{self, Asker, Order, Request};
+use super::jobs::{self, Asker, MAX_ORDERS, Order, Request};
 use super::load::Loading;
 use super::status::{Counters, ScanTimes, status};
 use super::watch::Watch;
@@ -132,8 +132,8 @@ impl Live {
             root: ctx.stack.root.clone(),
             header: header_of(&engine),
             acks: Acks::default(),
-            orders: Vec::with_capacity(64),
-            replies: Vec::with_capacity(64),
+            orders: Vec::with_capacity(MAX_ORDERS),
+            replies: Vec::with_capacity(MAX_ORDERS),
             loading: None,
             keyframe_next: None,
             keyframe_wanted: Some(Reason::EngineStart),
@@ -379,7 +379,9 @@ impl Live {
     fn scan(&mut self, ctx: &mut Context, now_ns: u64, due_ns: u64) {
         if self.restart_at_ns.is_some_and(|at| now_ns >= at) {
             self.restart_at_ns = None;
-            if let Some(kind) = restart_of(self.config.on_fault) {
+            // Who stops a faulted program means that it stays so.
+            let stopped = self.orders.iter().any(|(_, order)| *order == Order::Stop);
+            if let Some(kind) = restart_of(self.config.on_fault).filter(|_| !stopped) {
                 let me = Source { writer: ctx.writer, generation: ctx.generation, seq: 0 };
                 self.orders.push((me, Order::Start(kind)));
             }

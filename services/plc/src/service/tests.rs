@@ -190,10 +190,12 @@ mod any_job {
             bytes in prop::collection::vec(any::<u8>(), 0..60),
         ) {
             let engine = engine();
-            prop_assert!(jobs::parse(&bytes, &engine).is_err());
+            prop_assert!(jobs::parse(&bytes, &engine, &[]).is_err());
             for (what, var, value) in jobs {
                 let job = json!({ "do": what, "var": var, "value": value, "path": var });
-                let _ = jobs::parse(&serde_json::to_vec(&job).unwrap(), &engine);
+                let _ = jobs::parse(&serde_json::to_vec(&job).unwrap(), &engine, &[]);
+                let job = json!({ "do": what, "set": [job, value] });
+                let _ = jobs::parse(&serde_json::to_vec(&job).unwrap(), &engine, &[]);
             }
         }
     }

@@ -93,11 +93,12 @@ pub struct Counters {
     pub short: u64,
     /// PDOs of nodes that are not operational.
     pub not_operational: u64,
-    /// Samples published for a SYNC with everything in it.
+    /// Samples published for a SYNC with everything in it that was due: what comes every n-th SYNC when it is its turn,
+    /// what comes with a change (type 0) never.
     pub complete_samples: u64,
-    /// Samples published at the end of the window, with something missing.
+    /// Samples published at the end of the window, with something missing that was due.
     pub incomplete_samples: u64,
-    /// Synchronous PDOs that came outside of any window.
+    /// Synchronous PDOs that came outside of the window of any SYNC.
     pub outside_window: u64,
     /// Times an input became stale.
     pub stale: u64,

@@ -2,7 +2,7 @@
 
 use super::watch::Watch;
 use crate::config::ErrorPolicy;
-use crate::master::boot::{self, Boot, Failure, OPERATIONAL};
+use crate::master::boot::{self, Boot, Failure, Loaded, OPERATIONAL};
 
 /// How the network is run.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -38,11 +38,13 @@ pub struct NodeSettings {
 /// Something the user is told.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Event {
-    /// A node is booted; `kept`: it was running already and was left alone.
+    /// A node is booted; `kept`: it was running already and was left alone; `loaded`: why its configuration was loaded,
+    /// where that is a question of its date.
     Booted {
         node: u8,
         attempts: u32,
         kept: bool,
+        loaded: Option<Loaded>,
     },
     BootFailed {
         node: u8,

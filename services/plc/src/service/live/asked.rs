@@ -16,7 +16,7 @@ impl Live {
                 self.reply(&asker, 2, json!({ "error": "expired before it was read" }));
                 continue;
             }
-            match jobs::parse(&tail, &self.engine) {
+            match jobs::parse(&tail, &self.engine, &self.orders) {
                 Ok(request) => self.take_request(ctx, asker, request),
                 Err((code, text)) => self.reply(&asker, code, json!({ "error": text })),
             }
@@ -25,12 +25,13 @@ impl Live {
 
     fn take_request(&mut self, ctx: &mut Context, asker: Asker, request: Request) {
         match request {
-            Request::Order(order) => {
-                if self.orders.len() >= 64 {
-                    self.reply(&asker, 1, json!({ "error": "64 commands already wait for the next scan" }));
+            Request::Orders(orders) => {
+                if self.orders.len() + orders.len() > MAX_ORDERS {
+                    let text = format!("{} commands already wait for the next scan", self.orders.len());
+                    self.reply(&asker, 1, json!({ "error": text }));
                     return;
                 }
-                self.orders.push((asker.source, order));
+                self.orders.extend(orders.into_iter().map(|order| (asker.source, order)));
                 self.replies.push(asker);
                 self.hurry = true;
             }
@@ -93,6 +94,10 @@ impl Live {
             );
         }
         self.orders.clear();
+        // What waited was meant for the old program.
+        for asker in std::mem::take(&mut self.replies) {
+            self.reply(&asker, 1, json!({ "error": "another program was loaded meanwhile; ask again" }));
+        }
         self.orders.push((loading.asker.source, Order::Load(self.engine.program_hash())));
         self.orders.push((loading.asker.source, Order::Start(start)));
         self.replies.push(loading.asker);

@@ -15,9 +15,13 @@ impl Live {
                     ctx.set_state(HealthState::Ready);
                     self.restart_at_ns = None;
                 }
-                Order::Stop if before == PlcState::Run => {
-                    let detail = json!({ "by": by, "scan": self.engine.scan() });
-                    ctx.event(EventKind::PlcStopped, Level::Warning, format!("PLC stopped by {by}"), detail);
+                Order::Stop => {
+                    self.restart_at_ns = None;
+                    if before == PlcState::Run {
+                        let detail = json!({ "by": by, "scan": self.engine.scan() });
+                        let message = format!("PLC stopped by {by}");
+                        ctx.event(EventKind::PlcStopped, Level::Warning, message, detail);
+                    }
                 }
                 Order::Force(patch, path) => {
                     let text = self
@@ -49,7 +53,7 @@ impl Live {
                         json!({ "by": by }),
                     );
                 }
-                Order::Stop | Order::Set(..) | Order::Load(_) => {}
+                Order::Set(..) | Order::Load(_) => {}
             }
         }
         self.orders = orders;
