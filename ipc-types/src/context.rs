@@ -117,7 +117,7 @@ impl Context {
         let entry = find(&stack, topic)?;
         let mut bells = Vec::with_capacity(entry.wakes.len());
         for wake in &entry.wakes {
-            bells.push((self.bell(&wake.service)?, wake.event_id));
+            bells.push(self.bell(wake)?);
         }
         Publisher::new(&self.node, entry, bells, self.writer, self.generation)
     }
@@ -126,7 +126,7 @@ impl Context {
         if let Some(bell) = self.bells.get(service) {
             return Ok(bell.clone());
         }
-        let bell = Rc::new(Bell::open(&self.node, service)?);
+        let bell = Rc::new(Bell::open(&self.stack.root, service)?);
         self.bells.insert(service.to_owned(), bell.clone());
         Ok(bell)
     }
@@ -143,7 +143,7 @@ impl Context {
 
     /// This service's inbox.
     pub fn inbox(&self) -> Result<Inbox, RailError> {
-        Inbox::open(&self.node, &self.service)
+        Inbox::open(&self.stack.root, &self.service)
     }
 
     /// Takes over an inherited descriptor: a listener or the retain memory.

@@ -22,7 +22,7 @@
 //! # fn run(mut ctx: Context) -> Result<(), Box<dyn std::error::Error>> {
 //! let mut rx = ctx.subscriber::<CanFrame>("can0/rx")?;      // copies out, validates, counts gaps
 //! let mut tx = ctx.publisher::<CanFrame>("can0/tx")?;       // numbers, stamps, refuses when full
-//! let mut inbox = ctx.inbox()?;                             // one event service per consumer
+//! let mut inbox = ctx.inbox()?;                             // one per consumer: it rings
 //! let mut reactor = Reactor::new()?;
 //! let inbox_token = reactor.add(inbox.fd())?;
 //! let tick = reactor.add_timer(std::time::Duration::from_millis(100))?;
@@ -32,7 +32,7 @@
 //!     for wake in reactor.wait(None)?.to_vec() {
 //!         if wake == stop { return Ok(()); }
 //!         if wake == inbox_token {
-//!             inbox.drain();                                // level-triggered: drain on each wake
+//!             inbox.drain();                                // takes all rings; then look at every topic
 //!             rx.drain(256, |frame, _tail| { let _ = frame.can_id; });
 //!         }
 //!         if wake == tick { ctx.beat(); }                   // from the thread that does the work

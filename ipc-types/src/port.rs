@@ -49,7 +49,7 @@ pub struct Publisher<H: Payload> {
     port: IoxPublisher<Svc, [u8], H>,
     factory: Factory<H>,
     /// Rung by [`Publisher::ring`].
-    bells: Vec<(Rc<Bell>, u32)>,
+    bells: Vec<Rc<Bell>>,
     name: String,
     max_tail: u32,
     refuse: bool,
@@ -63,7 +63,7 @@ impl<H: Payload> Publisher<H> {
     pub(crate) fn new(
         node: &Node<Svc>,
         topic: &TopicEntry,
-        bells: Vec<(Rc<Bell>, u32)>,
+        bells: Vec<Rc<Bell>>,
         writer: u32,
         generation: u32,
     ) -> Result<Self, RailError> {
@@ -155,8 +155,8 @@ impl<H: Payload> Publisher<H> {
 
     /// Wakes the consumers of the topic. Once a batch is enough.
     pub fn ring(&self) {
-        for (bell, id) in &self.bells {
-            bell.ring(*id);
+        for bell in &self.bells {
+            bell.ring();
         }
     }
 

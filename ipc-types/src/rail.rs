@@ -103,11 +103,6 @@ pub fn clean_dead_nodes() -> Result<(u64, u64), RailError> {
     Ok((state.cleanups, state.failed_cleanups))
 }
 
-/// Name of a consumer's inbox on the rail.
-pub fn inbox_name(service: &str) -> String {
-    format!("inbox/{service}")
-}
-
 pub(crate) fn service_name(name: &str) -> Result<ServiceName, RailError> {
     ServiceName::new(name).map_err(|e| RailError::middleware(format!("service name '{name}'"), e))
 }
@@ -135,24 +130,6 @@ fn create_typed<T: Payload>(node: &Node<Svc>, topic: &TopicEntry) -> Result<Held
         .enable_safe_overflow(row.when_full == WhenFull::Oldest)
         .create()
         .map_err(|e| RailError::middleware(format!("creating topic '{}'", topic.name), e))?;
-    Ok(Held(Box::new(port_factory)))
-}
-
-/// Creates a consumer's inbox. Launcher only.
-pub fn create_inbox(node: &Node<Svc>, service: &str, notifiers: u32) -> Result<Held, RailError> {
-    let port_factory = node
-        .service_builder(&service_name(&inbox_name(service))?)
-        .event()
-        .max_listeners(4)
-        .max_notifiers((notifiers + SPARE_PORTS) as usize)
-        .max_nodes(MAX_NODES as usize)
-        .event_id_max_value(255)
-        .disable_deadline()
-        .disable_notifier_created_event()
-        .disable_notifier_dropped_event()
-        .disable_notifier_dead_event()
-        .create()
-        .map_err(|e| RailError::middleware(format!("creating inbox of '{service}'"), e))?;
     Ok(Held(Box::new(port_factory)))
 }
 

@@ -52,14 +52,6 @@ pub struct ServiceEntry {
     pub wiring: Wiring,
 }
 
-/// A consumer to wake for a topic.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Wake {
-    pub service: String,
-    /// Event id in the consumer's inbox.
-    pub event_id: u32,
-}
-
 /// A topic of the resolved stack.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TopicEntry {
@@ -69,7 +61,8 @@ pub struct TopicEntry {
     pub max_tail: u32,
     pub writers: Vec<String>,
     pub readers: Vec<String>,
-    pub wakes: Vec<Wake>,
+    /// Services whose inbox a writer rings.
+    pub wakes: Vec<String>,
     /// Limits as created.
     pub max_publishers: u32,
     pub max_subscribers: u32,

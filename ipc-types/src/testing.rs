@@ -7,7 +7,7 @@
 pub mod allocations;
 
 use crate::rail::{self, Held, Svc};
-use crate::stack::{ServiceEntry, Stack, TopicEntry, Wake};
+use crate::stack::{ServiceEntry, Stack, TopicEntry};
 use crate::topic::{EVENTS, TopicKind};
 use crate::{Context, Wiring};
 use iceoryx2::node::Node;
@@ -80,10 +80,10 @@ impl TopicEntry {
         self.max_tail = max_tail;
         self
     }
-    /// Wakes this service under this event id.
+    /// Wakes this service.
     #[must_use]
-    pub fn wakes(mut self, service: &str, event_id: u32) -> Self {
-        self.wakes.push(Wake { service: service.to_owned(), event_id });
+    pub fn wakes(mut self, service: &str) -> Self {
+        self.wakes.push(service.to_owned());
         self
     }
 }
@@ -119,8 +119,7 @@ pub struct TestRail {
 }
 
 impl TestRail {
-    /// Makes a rail of these topics; events, health and status of all services are added. An inbox is made for
-    /// each service that a topic wakes.
+    /// Makes a rail of these topics; events, health and status of all services are added.
     pub fn new(name: &str, services: Vec<ServiceEntry>, topics: Vec<TopicEntry>) -> Self {
         Self::in_folder(Path::new("."), name, services, topics)
     }
@@ -158,12 +157,7 @@ impl TestRail {
         write(&stack);
         rail::join(&stack.root).unwrap();
         let launcher = rail::node("launcher").unwrap();
-        let mut held: Vec<_> =
-            stack.topics.iter().map(|t| rail::create_topic(&launcher, t).unwrap()).collect();
-        let woken = |name: &str| stack.topics.iter().flat_map(|t| &t.wakes).any(|w| w.service == name);
-        for service in stack.services.iter().filter(|s| woken(&s.name)) {
-            held.push(rail::create_inbox(&launcher, &service.name, 4).unwrap());
-        }
+        let held = stack.topics.iter().map(|t| rail::create_topic(&launcher, t).unwrap()).collect();
         Self { stack, _held: held, _launcher: launcher, _wipe: wipe }
     }
 

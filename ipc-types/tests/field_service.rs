@@ -129,7 +129,7 @@ fn a_field_service_has_turns_inputs_outputs_and_a_queue() {
         vec![
             topic(TopicKind::CanTx, "can0").depth(4),
             topic(TopicKind::Inputs, "io"),
-            topic(TopicKind::Image, "plc").wakes("io", 1),
+            topic(TopicKind::Image, "plc").wakes("io"),
         ],
     );
     let mut ctx = rail.context("io");

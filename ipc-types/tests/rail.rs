@@ -15,8 +15,8 @@ fn the_rail_carries_numbers_refuses_and_wakes() {
         "railtest",
         vec![service("a", "test", serde_json::Value::Null, Wiring::default())],
         vec![
-            topic(TopicKind::CanRx, "can0").depth(8).wakes("a", 3),
-            topic(TopicKind::CanTx, "can0").depth(4).wakes("a", 3),
+            topic(TopicKind::CanRx, "can0").depth(8).wakes("a"),
+            topic(TopicKind::CanTx, "can0").depth(4).wakes("a"),
             topic(TopicKind::Inputs, "io").depth(2),
         ],
     );
@@ -36,7 +36,7 @@ fn the_rail_carries_numbers_refuses_and_wakes() {
     }
     port.ring();
     assert!(reactor.wait(Some(Duration::from_secs(10))).unwrap().contains(&token));
-    assert_eq!(inbox.drain(), 1 << 3);
+    assert!(inbox.drain());
     assert!(reactor.wait(Some(Duration::ZERO)).unwrap().is_empty(), "the inbox was drained");
     let mut got = Vec::new();
     rx.drain(100, |frame, tail| {

@@ -7,7 +7,7 @@ use super::place::Sink;
 use super::{Loader, build_id};
 use ipc_types::plc_table;
 use ipc_types::rail::{place, port_limits};
-use ipc_types::stack::{ServiceEntry, Stack, TopicEntry, Wake};
+use ipc_types::stack::{ServiceEntry, Stack, TopicEntry};
 use ipc_types::topic::{EVENTS, TopicKind, WhenFull};
 use ipc_types::wiring::{Neighbours, TopicDecl, Wiring};
 use std::collections::BTreeMap;
@@ -16,8 +16,6 @@ use std::collections::BTreeMap;
 pub const LAUNCHER: &str = "launcher";
 /// Kind of the services that own a process image.
 pub const PLC: &str = "plc";
-/// Largest event id of an inbox.
-const EVENT_ID_MAX: u32 = 255;
 
 /// Resolves the document. Names that lead nowhere go to the sink.
 pub fn resolve(document: &Document, loader: &Loader<'_>, text: &str, sink: &mut Sink<'_>) -> Stack {
@@ -199,22 +197,11 @@ impl<'a, 's, 't> Rail<'a, 's, 't> {
     }
 
     fn wake(&mut self, topic: &str, service: &str) {
-        let event_id =
-            self.topics.iter().flat_map(|(t, _)| &t.wakes).filter(|w| w.service == service).count() as u32;
-        let Some((entry, _)) = self.topic(topic) else { return };
-        if entry.wakes.iter().any(|w| w.service == service) {
-            return;
+        if let Some((topic, _)) = self.topic(topic)
+            && !topic.wakes.iter().any(|w| w == service)
+        {
+            topic.wakes.push(service.to_owned());
         }
-        if event_id <= EVENT_ID_MAX {
-            entry.wakes.push(Wake { service: service.to_owned(), event_id });
-            return;
-        }
-        let place = self.document.place(service, "");
-        self.sink.error(
-            &place,
-            format!("more than {} topics wake service '{service}'", EVENT_ID_MAX + 1),
-            "give it fewer neighbours, or split it into two services",
-        );
     }
 
     fn reads(&mut self, entry: &ServiceEntry) {

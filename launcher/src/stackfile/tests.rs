@@ -241,13 +241,12 @@ fn a_right_stack_is_wired() {
     assert!(stack.services[2].config.get("name").is_none());
     let mut lines = Vec::new();
     for topic in &stack.topics {
-        let wakes: Vec<_> = topic.wakes.iter().map(|w| format!("{}={}", w.service, w.event_id)).collect();
         lines.push(format!(
             "{}: {} -> {} wakes [{}] limits {}/{}",
             topic.name,
             topic.writers.join(" "),
             topic.readers.join(" "),
-            wakes.join(" "),
+            topic.wakes.join(" "),
             topic.max_publishers,
             topic.max_subscribers
         ));

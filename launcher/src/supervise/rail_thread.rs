@@ -137,12 +137,9 @@ fn serve(
 ) -> Result<(), RailError> {
     rail::join(&stack.root)?;
     let node = rail::node("launcher")?;
-    let mut held: Vec<Held> = Vec::with_capacity(stack.topics.len() + stack.services.len());
+    let mut held: Vec<Held> = Vec::with_capacity(stack.topics.len());
     for topic in &stack.topics {
         held.push(rail::create_topic(&node, topic)?);
-    }
-    for service in &stack.services {
-        held.push(rail::create_inbox(&node, &service.name, stack.services.len() as u32)?);
     }
     let mut ctx = Context::observer(&stack.root)?;
     // The launcher is writer 0 of the rail, and the rail's only launcher.

@@ -72,9 +72,9 @@ fn frames_and_image() {
             service("probe", "test", serde_json::Value::Null, Wiring::default()),
         ],
         vec![
-            topic(TopicKind::CanRx, "can0").wakes("io", 1),
+            topic(TopicKind::CanRx, "can0").wakes("io"),
             topic(TopicKind::CanTx, "can0"),
-            topic(TopicKind::Image, "plc").max_tail(64).wakes("io", 1),
+            topic(TopicKind::Image, "plc").max_tail(64).wakes("io"),
             topic(TopicKind::Inputs, "io").max_tail(tail),
         ],
     );

@@ -442,9 +442,9 @@ async fn work(
                 return Ok(());
             }
             rang = inbox_fd.readable() => {
-                let mut guard = rang.map_err(system("waiting for the rail"))?;
+                // First cleared, then drained: what rings in between is an arrival again.
+                rang.map_err(system("waiting for the rail"))?.clear_ready();
                 inbox.drain();
-                guard.clear_ready();
                 more = true;
             }
             // One turn at a time, so that writers that never pause keep neither the heartbeat nor the end waiting.

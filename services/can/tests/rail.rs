@@ -74,8 +74,8 @@ fn a_bus_on_the_rail() {
             service("probe", "can", serde_json::Value::Null, Wiring::default()),
         ],
         vec![
-            topic(TopicKind::CanRx, "can0").depth(rx_depth).wakes("probe", 1),
-            topic(TopicKind::CanTx, "can0").depth(1024).wakes("can0", 1),
+            topic(TopicKind::CanRx, "can0").depth(rx_depth).wakes("probe"),
+            topic(TopicKind::CanTx, "can0").depth(1024).wakes("can0"),
         ],
     );
     let mut ctx = rail.context("probe");

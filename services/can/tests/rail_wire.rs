@@ -50,7 +50,7 @@ fn what_has_no_place_in_the_queue_is_taken_from_the_topic_later() {
         ],
         vec![
             topic(TopicKind::CanRx, "can0").depth(1024),
-            topic(TopicKind::CanTx, "can0").depth(1024).wakes("can0", 1),
+            topic(TopicKind::CanTx, "can0").depth(1024).wakes("can0"),
         ],
     );
     let mut ctx = rail.context("probe");

@@ -233,11 +233,11 @@ fn rail() -> TestRail {
         ],
         vec![
             topic(TopicKind::Image, "plc"),
-            topic(TopicKind::Writes, "plc").wakes("plc", 0),
-            topic(TopicKind::Inputs, "modbus").wakes("plc", 0),
-            topic(TopicKind::Jobs, "modbus").wakes("modbus", 0),
+            topic(TopicKind::Writes, "plc").wakes("plc"),
+            topic(TopicKind::Inputs, "modbus").wakes("plc"),
+            topic(TopicKind::Jobs, "modbus").wakes("modbus"),
             topic(TopicKind::Results, "modbus"),
-            topic(TopicKind::SerialRx, "com1").wakes("modbus", 1),
+            topic(TopicKind::SerialRx, "com1").wakes("modbus"),
             topic(TopicKind::SerialTx, "com1"),
         ],
     )

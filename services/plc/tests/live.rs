@@ -14,7 +14,7 @@ use ipc_types::image_write::{Builder, Op};
 use ipc_types::payload::{Event, Image, ImageWrite, Inputs, Job, JobResult, PlcState, ScanPart, acks};
 use ipc_types::port::{Publisher, Subscriber};
 use ipc_types::scan_record::{Joiner, MAX_KEYFRAME_BYTES, MAX_RECORD_BYTES};
-use ipc_types::stack::{ServiceEntry, Stack, TopicEntry, Wake};
+use ipc_types::stack::{ServiceEntry, Stack, TopicEntry};
 use ipc_types::topic::{EVENTS, TopicKind};
 use ipc_types::wiring::{Area, ImageRange, Neighbours, OnBad};
 use ipc_types::{Context, Wiring, clock, rail};
@@ -122,7 +122,7 @@ fn stack(name: &str, root: &Path, prefix: &str, dir: &Path, config: &Value) -> S
     let plc = dinrail_plc::topics(&plc_config, &neighbours);
     let io = Wiring { plc: Some("plc".into()), inputs: vec![level_range()], ..Wiring::default() };
     let mut topics = Vec::new();
-    let mut add = |name: String, kind: TopicKind, depth: u32, max_tail: u32, wakes: Vec<Wake>| {
+    let mut add = |name: String, kind: TopicKind, depth: u32, max_tail: u32, wakes: Vec<String>| {
         let (max_publishers, max_subscribers) = rail::port_limits(kind, 3, 3);
         let (writers, readers) = (Vec::new(), Vec::new());
         topics.push(TopicEntry {
@@ -137,11 +137,10 @@ fn stack(name: &str, root: &Path, prefix: &str, dir: &Path, config: &Value) -> S
             max_subscribers,
         });
     };
-    let wakes_plc = |event_id| vec![Wake { service: "plc".into(), event_id }];
     for decl in &plc.topics {
         let wakes = match decl.kind {
-            TopicKind::Writes => wakes_plc(0),
-            TopicKind::Jobs => wakes_plc(1),
+            TopicKind::Writes => vec!["plc".into()],
+            TopicKind::Jobs => vec!["plc".into()],
             _ => Vec::new(),
         };
         add(decl.kind.of("plc"), decl.kind, decl.depth, decl.max_tail, wakes);
@@ -154,7 +153,7 @@ fn stack(name: &str, root: &Path, prefix: &str, dir: &Path, config: &Value) -> S
     ] {
         add(kind.of(service), kind, kind.row().depth, kind.row().max_tail, Vec::new());
     }
-    add("io/inputs".into(), TopicKind::Inputs, 4, 4096, wakes_plc(2));
+    add("io/inputs".into(), TopicKind::Inputs, 4, 4096, vec!["plc".into()]);
     add(EVENTS.into(), TopicKind::Events, 256, 8192, Vec::new());
     let entry = |name: &str, index: u32, config: Value, wiring: Wiring| ServiceEntry {
         name: name.into(),
@@ -317,8 +316,7 @@ fn a_plc_service_from_its_first_scan_to_its_return_from_death() {
     std::fs::write(root.join(rail::STACK_FILE), serde_json::to_vec(&stack).unwrap()).unwrap();
     rail::join(&root).unwrap();
     let launcher = rail::node("launcher").unwrap();
-    let mut held: Vec<_> = stack.topics.iter().map(|t| rail::create_topic(&launcher, t).unwrap()).collect();
-    held.push(rail::create_inbox(&launcher, "plc", 8).unwrap());
+    let _held: Vec<_> = stack.topics.iter().map(|t| rail::create_topic(&launcher, t).unwrap()).collect();
     let retain_fd = rustix::fs::memfd_create("retain", rustix::fs::MemfdFlags::empty()).unwrap();
     rustix::fs::ftruncate(&retain_fd, retain::MEMORY_BYTES as u64).unwrap();
     let mut ctx = Context::service(&root, "io", 1, BTreeMap::new()).unwrap();

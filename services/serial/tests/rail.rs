@@ -101,9 +101,9 @@ fn frames_both_ways_echoes_and_a_port_that_goes_and_comes() {
         ],
         vec![
             topic(TopicKind::SerialRx, "com1"),
-            topic(TopicKind::SerialTx, "com1").wakes("com1", 0),
+            topic(TopicKind::SerialTx, "com1").wakes("com1"),
             topic(TopicKind::SerialRx, "com2"),
-            topic(TopicKind::SerialTx, "com2").wakes("com2", 0),
+            topic(TopicKind::SerialTx, "com2").wakes("com2"),
         ],
     );
     let mut ctx = rail.context("user");
