@@ -1,6 +1,7 @@
 //! No ring is ever lost, however many writers ring at once and however the consumer waits: each writes a number, rings,
 //! and waits until the consumer, which looks only when its inbox rang, has seen it. One test function, because a process
 //! belongs to one rail for its whole life.
+#![allow(clippy::unwrap_used, reason = "a test may end like this")]
 
 use ipc_types::Wiring;
 use ipc_types::payload::CanFrame;

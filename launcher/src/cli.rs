@@ -232,7 +232,7 @@ pub enum PlcCommand {
         #[arg(required = true, value_name = "VAR")]
         variables: Vec<String>,
     },
-    /// Set variables or %-addresses once
+    /// Set variables or %-addresses once, all in one scan; none when one of them is wrong
     Write {
         #[arg(required = true, value_name = "VAR=VALUE")]
         assignments: Vec<String>,

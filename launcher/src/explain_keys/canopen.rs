@@ -6,6 +6,8 @@ use super::{KeyDoc, ValueKind, may, need, with};
 
 /// A number of the stack file: `5`, `"0x1F"`, `"$NODEID+0x180"`.
 const NUMBER: ValueKind = OneOf(&[Int(i64::MIN, i64::MAX), Bool, Number, Text]);
+/// An identifier: `5` or `"0x1F"`.
+const ID: ValueKind = OneOf(&[Int(0, u32::MAX as i64), Text]);
 /// States of the PLC.
 const STATES: ValueKind = List(&Choice(&["stop", "fault", "halted"]));
 
@@ -90,9 +92,14 @@ pub const CANOPEN_MASTER: &[KeyDoc] = &[
         "node[].heartbeat",
         Duration,
         "no heartbeat",
-        "Producer heartbeat time written to the node (1017h); it is lost after three times as long.",
+        "Producer heartbeat time written to the node (1017h), whole ms up to 65535ms; it is lost after three times as long.",
     ),
-    may("node[].guarding", Table, "no guarding", "Node guarding by remote frames, instead of heartbeat."),
+    may(
+        "node[].guarding",
+        Table,
+        "no guarding",
+        "Node guarding by remote frames, instead of heartbeat; not both.",
+    ),
     need("node[].guarding.time", Duration, "Guard time (100Ch)."),
     need("node[].guarding.factor", Int(1, 255), "Life time factor (100Dh)."),
     with(
@@ -101,11 +108,11 @@ pub const CANOPEN_MASTER: &[KeyDoc] = &[
         "[\"device_type\", \"vendor\", \"product\"]",
         "What of the node's identity (1000h, 1018h) must be as in the EDS before it is configured.",
     ),
-    may("node[].device_type", NUMBER, "the EDS's", "Expected 1000h."),
-    may("node[].vendor_id", NUMBER, "the EDS's", "Expected 1018h:01."),
-    may("node[].product_code", NUMBER, "the EDS's", "Expected 1018h:02."),
-    may("node[].revision", NUMBER, "the EDS's", "Expected 1018h:03."),
-    may("node[].serial_number", NUMBER, "not checked", "Expected 1018h:04."),
+    may("node[].device_type", ID, "the EDS's", "Expected 1000h, as 401 or \"0x191\"."),
+    may("node[].vendor_id", ID, "the EDS's", "Expected 1018h:01, as 401 or \"0x191\"."),
+    may("node[].product_code", ID, "the EDS's", "Expected 1018h:02, as 401 or \"0x191\"."),
+    may("node[].revision", ID, "the EDS's", "Expected 1018h:03, as 401 or \"0x191\"."),
+    may("node[].serial_number", ID, "not checked", "Expected 1018h:04, as 401 or \"0x191\"."),
     may(
         "node[].config_date",
         Int(0, u32::MAX as i64),
@@ -130,7 +137,7 @@ pub const CANOPEN_MASTER: &[KeyDoc] = &[
     with("node[].tpdo", Tables, "[]", "Transmit PDOs of the node that differ from its EDS."),
     need("node[].tpdo[].number", Int(1, 512), "Number of the PDO, from 1."),
     with("node[].tpdo[].enabled", Bool, "true", "Whether it exists."),
-    may("node[].tpdo[].cob_id", NUMBER, "the EDS's", "Its COB-ID."),
+    may("node[].tpdo[].cob_id", ID, "the EDS's", "Its COB-ID, as \"0x1C5\" or \"$NODEID+0x180\"."),
     may(
         "node[].tpdo[].transmission",
         TRANSMISSION,
@@ -149,7 +156,7 @@ pub const CANOPEN_MASTER: &[KeyDoc] = &[
     with("node[].rpdo", Tables, "[]", "Receive PDOs of the node that differ from its EDS."),
     need("node[].rpdo[].number", Int(1, 512), "Number of the PDO, from 1."),
     with("node[].rpdo[].enabled", Bool, "true", "Whether it exists."),
-    may("node[].rpdo[].cob_id", NUMBER, "the EDS's", "Its COB-ID."),
+    may("node[].rpdo[].cob_id", ID, "the EDS's", "Its COB-ID, as \"0x245\" or \"$NODEID+0x200\"."),
     may(
         "node[].rpdo[].transmission",
         TRANSMISSION,

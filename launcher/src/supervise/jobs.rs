@@ -43,7 +43,10 @@ fn choose_of(stack: &str, kind: &str, list: &[&str], named: Option<&str>) -> any
             anyhow::bail!("stack '{stack}' has no {kind} service '{name}'; it has {}", list.join(", "))
         }
         (None, [only]) => Ok((*only).to_owned()),
-        (None, list) => anyhow::bail!("several {kind} services: {}; say which one", list.join(", ")),
+        (None, list) => {
+            let option = if kind == "can" { "--bus" } else { "--service" };
+            anyhow::bail!("several {kind} services: {}; say which one with {option} NAME", list.join(", "))
+        }
     }
 }
 
@@ -205,7 +208,7 @@ mod tests {
         assert_eq!(choose_of("s", "plc", &["a", "b"], Some("b")).unwrap(), "b");
         let error = |list: &[&str], named| choose_of("s", "plc", list, named).unwrap_err().to_string();
         assert_eq!(error(&[], None), "stack 's' has no plc service");
-        assert_eq!(error(&["a", "b"], None), "several plc services: a, b; say which one");
+        assert_eq!(error(&["a", "b"], None), "several plc services: a, b; say which one with --service NAME");
         assert_eq!(error(&["a"], Some("c")), "stack 's' has no plc service 'c'; it has a");
     }
 

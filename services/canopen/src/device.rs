@@ -49,13 +49,9 @@ impl Device {
                 if self.od.find(*index, *sub).is_ok() {
                     return Ok((*index, *sub));
                 }
-                let subs: Vec<String> = self
-                    .od
-                    .entries_of(*index)
-                    .map(|(_, e)| format!("{:04X}:{:02X}", e.index, e.sub))
-                    .collect();
+                let subs = self.nearest_subs(*index, *sub);
                 let near = if subs.is_empty() { self.nearest(*index) } else { subs };
-                Err(format!("the EDS has no object {object}; it has {}", near.join(", ")))
+                Err(format!("the EDS has no object {object}; near to it are {}", near.join(", ")))
             }
             ObjectRef::Name(name) => {
                 let same = |n: &&Named| {
@@ -81,7 +77,26 @@ impl Device {
         all.sort_by_key(|&i| i.abs_diff(index));
         all.truncate(3);
         all.sort_unstable();
-        all.iter().map(|i| format!("{i:04X}")).collect()
+        let of_index = |index: u16| self.names.iter().find(|n| n.index == index);
+        let object =
+            |n: &Named| n.name.split_once(", ").map_or(n.name.clone(), |(object, _)| object.to_owned());
+        all.iter()
+            .map(|&i| of_index(i).map_or(format!("{i:04X}"), |n| format!("{i:04X} '{}'", object(n))))
+            .collect()
+    }
+
+    /// Up to three sub-objects of an index beside a sub-index.
+    fn nearest_subs(&self, index: u16, sub: u8) -> Vec<String> {
+        let mut subs: Vec<u8> = self.od.entries_of(index).map(|(_, e)| e.sub).collect();
+        subs.sort_by_key(|s| s.abs_diff(sub));
+        subs.truncate(3);
+        subs.sort_unstable();
+        let text = |sub: u8| {
+            let number = format!("{index:04X}:{sub:02X}");
+            let name = self.name_of(index, sub).map(|n| n.split_once(", ").map_or(n, |(_, sub)| sub));
+            name.map_or(number.clone(), |name| format!("{number} '{name}'"))
+        };
+        subs.into_iter().map(text).collect()
     }
 
     fn no_such_name(&self, name: &str) -> String {

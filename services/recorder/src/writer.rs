@@ -30,6 +30,9 @@ use std::time::{Duration, Instant};
 
 /// Time between attempts to record again after the disk failed.
 const RETRY: Duration = Duration::from_secs(5);
+/// How often, and how long between, a file to be made whole is looked at again while it is in use: 10 s.
+const SEAL_LOOKS: u32 = 50;
+const SEAL_PAUSE: Duration = Duration::from_millis(200);
 /// A file that is due is ended when a keyframe comes, at the latest after this.
 const KEYFRAME_WAIT: Duration = Duration::from_millis(500);
 /// Gap counters are written this often although nothing was lost.
@@ -580,7 +583,7 @@ impl Writer {
         let (notices, shared) = (self.notices.clone(), self.shared.clone());
         let work = move || {
             for path in files {
-                let (fault, message) = match seal::recover(&path) {
+                let (fault, message) = match recover_when_free(&path) {
                     Ok(report) => (false, format!("made {} whole: {report}", path.display())),
                     Err(seal::SealError::InUse(_)) => continue,
                     Err(error) => (true, error.to_string()),
@@ -593,6 +596,21 @@ impl Writer {
             }
         };
         let _ = std::thread::Builder::new().name("rec-seal".into()).spawn(work);
+    }
+}
+
+/// A file that is given up may be in use for as long as its last data takes to the disk; one that is in use for longer is
+/// another recorder's.
+fn recover_when_free(path: &Path) -> Result<seal::Report, seal::SealError> {
+    let mut looks = SEAL_LOOKS;
+    loop {
+        match seal::recover(path) {
+            Err(seal::SealError::InUse(_)) if looks > 0 => {
+                looks -= 1;
+                std::thread::sleep(SEAL_PAUSE);
+            }
+            result => return result,
+        }
     }
 }
 

@@ -9,6 +9,7 @@ mod common;
 use common::{Rig, TempDir, frame, stack, wait_for};
 use dinrail_recorder::{Config, disk, info};
 use ipc_types::clock;
+use std::time::Duration;
 
 /// Bytes that a file of this process may have.
 #[allow(unsafe_code)]
@@ -34,7 +35,17 @@ fn beginnings_of_files_are_removed_and_files_with_messages_made_whole() {
         rig.send(&messages);
         rig.settle();
     };
-    let size = |rig: &Rig| rig.files()[0].metadata().unwrap().len();
+    // What was sent reaches the file with the next flush, at most 50 ms later: until it has not grown for four of them.
+    let size = |rig: &Rig| {
+        let now = || rig.files().first().and_then(|file| file.metadata().ok()).map_or(0, |m| m.len());
+        let mut last = 0;
+        wait_for("everything in the file", || {
+            std::thread::sleep(Duration::from_millis(200));
+            let before = std::mem::replace(&mut last, now());
+            before > 0 && before == last
+        });
+        last
+    };
     wait_for("the first file", || rig.progress().files == 1);
     // The file is begun, and there is no room for a message.
     limit_files(size(&rig));

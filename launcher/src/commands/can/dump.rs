@@ -13,7 +13,10 @@ use std::fs::File;
 use std::io::{BufWriter, IsTerminal, Write};
 use std::path::Path;
 use std::process::ExitCode;
-use std::time::Instant;
+use std::time::{Duration, Instant};
+
+/// After so long without any frame the user is told once.
+const QUIET: Duration = Duration::from_secs(5);
 
 pub fn run(args: &DumpArgs, json: bool) -> anyhow::Result<ExitCode> {
     let to_stdout = args.log.as_deref() == Some(Path::new("-"));
@@ -39,12 +42,14 @@ pub fn run(args: &DumpArgs, json: bool) -> anyhow::Result<ExitCode> {
     let mut ended = left == 0;
     let mut told = 0;
     let mut heard = begin;
+    let mut quiet = Quiet::default();
     while !ended {
         ended = reactor.wait(Some(LOOK * 4))?.contains(&stop)
             || ended_by(begin, args.duration)
             || ended_by(heard, args.silence);
         let (mut text, mut lines) = (String::new(), String::new());
         listener.look(ended, |bus, message| {
+            quiet.heard = true;
             let bus = buses[bus].as_str();
             if filter.takes(bus, message) {
                 let utc_ns = (message.stamp.t_ns as i64 + offset_ns).max(0) as u64;
@@ -66,8 +71,30 @@ pub fn run(args: &DumpArgs, json: bool) -> anyhow::Result<ExitCode> {
         }
         ended |= !text.is_empty() && !super::put(&text);
         told = tell_losses(&listener, told, ended);
+        if let Some(note) = quiet.note(begin.elapsed()).filter(|_| !ended) {
+            eprintln!("dinrail: {note}");
+        }
     }
     Ok(if told > 0 { ExitCode::from(DATA_LOSS) } else { ExitCode::SUCCESS })
+}
+
+/// Whether the buses are silent from the start, and whether that was told.
+#[derive(Default)]
+struct Quiet {
+    heard: bool,
+    told: bool,
+}
+
+impl Quiet {
+    fn note(&mut self, waited: Duration) -> Option<&'static str> {
+        if self.heard || self.told || waited < QUIET {
+            return None;
+        }
+        self.told = true;
+        Some(
+            "no frame for 5 s: is the bus driver up, is anybody sending? Ctrl-C ends; --for and --silence end by themselves",
+        )
+    }
 }
 
 /// At the first loss and at the end.
@@ -151,6 +178,15 @@ mod tests {
         let Command::Can(CanCommand::Dump(args)) = cli.command else { panic!() };
         let to_stdout = args.log.as_deref() == Some(Path::new("-"));
         refusal(&args, cli.json, to_stdout).map_or_else(|| "ok".to_owned(), |e| e.to_string())
+    }
+
+    #[test]
+    fn a_silent_bus_is_told_once() {
+        let mut quiet = Quiet::default();
+        assert_eq!(quiet.note(Duration::from_millis(4999)), None);
+        assert!(quiet.note(QUIET).is_some_and(|note| note.contains("--silence")));
+        assert_eq!(quiet.note(QUIET * 2), None);
+        assert_eq!(Quiet { heard: true, told: false }.note(QUIET), None);
     }
 
     #[test]

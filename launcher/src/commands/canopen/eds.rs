@@ -21,6 +21,9 @@ pub fn check(files: &[PathBuf], as_json: bool) -> anyhow::Result<ExitCode> {
             Err(e) => {
                 wrong = true;
                 eprintln!("dinrail: {e:#}");
+                if as_json {
+                    println(&json!({ "file": file, "error": format!("{e:#}") }).to_string());
+                }
                 continue;
             }
         };
@@ -52,6 +55,7 @@ pub fn check(files: &[PathBuf], as_json: bool) -> anyhow::Result<ExitCode> {
     Ok(if wrong { ExitCode::FAILURE } else { ExitCode::SUCCESS })
 }
 
+/// Fails when nothing matches.
 pub fn show(file: &Path, filter: Option<&str>, as_json: bool) -> anyhow::Result<()> {
     let eds = read(file)?;
     let wanted = filter.unwrap_or_default().to_ascii_lowercase();
@@ -70,10 +74,28 @@ pub fn show(file: &Path, filter: Option<&str>, as_json: bool) -> anyhow::Result<
         }));
         rows.push(vec![object, data_type.to_owned(), entry.access.word().to_owned(), pdo.to_owned(), name]);
     }
+    if list.is_empty()
+        && let Some(filter) = filter
+    {
+        anyhow::bail!("nothing in {} matches '{filter}', by index or name", file.display());
+    }
     if as_json {
         println(&json!(list).to_string());
     } else {
         println(table(&["OBJECT", "TYPE", "ACCESS", "PDO", "NAME"], &rows).trim_end());
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_filter_that_nothing_matches_is_an_error() {
+        let file = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../services/canopen/src/slave/io401.eds"));
+        assert!(show(file, Some("6000"), true).is_ok());
+        let error = show(file, Some("zzz"), false).unwrap_err().to_string();
+        assert!(error.contains("io401.eds matches 'zzz'"), "{error}");
+    }
 }

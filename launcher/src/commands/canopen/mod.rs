@@ -184,7 +184,7 @@ pub struct EmcyArgs {
     /// Only of this node
     #[arg(value_parser = clap::value_parser!(u8).range(1..=127))]
     pub node: Option<u8>,
-    /// Forget them; the list in the device (1003h) stays
+    /// Forget them; the list in the device (1003h) stays. They live in the master's process and end with it
     #[arg(long)]
     pub clear: bool,
     #[command(flatten)]
@@ -238,7 +238,12 @@ pub struct AddressArgs {
     /// Serial number (1018h:04)
     #[arg(long, value_parser = number, required_unless_present = "sole")]
     pub serial: Option<u32>,
-    /// The only device of the bus, whatever its identity
+    /// The only device of the bus, whatever its identity; refused when several answer
+    ///
+    /// All devices enter configuration and are asked for their serial number; when more than one answers nothing is
+    /// changed. A device that answers too late, whose answer is lost, or whose equal answer meets another's on the wire
+    /// is not seen and gets the same node-id or bit rate. Unequal answers at the very same moment are errors on the bus.
+    /// Where there may be several, give the identity, or let `lss fastscan` find them.
     #[arg(long, conflicts_with_all = ["vendor", "product", "revision", "serial"])]
     pub sole: bool,
 }
@@ -440,9 +445,7 @@ pub fn run(command: CanopenCommand, json: bool) -> anyhow::Result<ExitCode> {
         CanopenCommand::Eds(EdsCommand::Show { file, filter }) => {
             done(eds::show(&file, filter.as_deref(), json))
         }
-        CanopenCommand::Dcf(DcfCommand::Make { stack, node, service, output }) => {
-            done(plan::dcf(&stack, node, service.as_deref(), output.as_deref()))
-        }
+        CanopenCommand::Dcf(command) => done(plan::dcf(&command, json)),
         CanopenCommand::Plan { stack } => done(plan::run(&stack, json)),
     }
 }

@@ -52,7 +52,11 @@ fn status_text(service: &str, status: &Value) -> String {
         .iter()
         .map(|n| {
             let mandatory = if n["mandatory"] == json!(true) { "yes" } else { "no" };
-            let emcy = n.get("last_emcy").map_or_else(|| "-".to_owned(), &word);
+            let emcy = match n.get("last_emcy") {
+                Some(reset) if reset == "0000h" => "none (0000h: reset)".to_owned(),
+                Some(emcy) => word(emcy),
+                None => "-".to_owned(),
+            };
             vec![
                 word(&n["id"]),
                 word(&n["name"]),
@@ -241,6 +245,7 @@ mod tests {
             "node_id": 1, "state": "pre-operational", "started": false, "bus_off": false,
             "nodes": [
                 { "id": 2, "name": "Simulated I/O", "state": "operational", "boot": "booted", "mandatory": true },
+                { "id": 4, "name": "Valve", "state": "operational", "boot": "booted", "mandatory": false, "last_emcy": "0000h" },
                 { "id": 3, "name": "Drive", "state": "unknown", "boot": "waiting for the next try", "mandatory": true,
                   "last_emcy": "8130h", "letter": "B", "failure": "boot-up failed with letter B: no answer; try 3" },
             ],
@@ -253,6 +258,7 @@ mod tests {
 
         NODE  NAME           NMT STATE    BOOT                      MANDATORY  LAST EMCY
         2     Simulated I/O  operational  booted                    yes        -
+        4     Valve          operational  booted                    no         none (0000h: reset)
         3     Drive          unknown      waiting for the next try  yes        8130h
 
         node 3: boot-up failed with letter B: no answer; try 3

@@ -1,6 +1,7 @@
 //! `dinrail canopen plan` and `dcf make`: what a master will do, without a bus.
 
 use super::super::{println, table};
+use super::DcfCommand;
 use crate::stackfile::load;
 use anyhow::Context as _;
 use dinrail_can::protocol::busload::{Stuffing, bits};
@@ -169,7 +170,9 @@ fn text(network: &Network) -> String {
 }
 
 /// The EDS of a node with the values that its master writes.
-pub fn dcf(path: &Path, node: u8, service: Option<&str>, output: Option<&Path>) -> anyhow::Result<()> {
+pub fn dcf(command: &DcfCommand, as_json: bool) -> anyhow::Result<()> {
+    let DcfCommand::Make { stack: path, node, service, output } = command;
+    let (node, service) = (*node, service.as_deref());
     let (stack, networks) = networks(path)?;
     let network = match (service, networks.as_slice()) {
         (Some(name), all) => all.iter().find(|n| n.name == name),
@@ -200,7 +203,13 @@ pub fn dcf(path: &Path, node: u8, service: Option<&str>, output: Option<&Path>) 
     options.commissioning.baud_rate = network.bitrate.map_or(0, |r| (r / 1000) as u16);
     let text = eds.dcf(&options, &values)?;
     match output {
-        Some(path) => std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))?,
+        Some(path) => {
+            std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))?;
+            if as_json {
+                println(&json!({ "node": node, "file": path }).to_string());
+            }
+        }
+        None if as_json => println(&json!({ "node": node, "dcf": text }).to_string()),
         None => super::super::print(&text),
     }
     Ok(())

@@ -1,6 +1,6 @@
 //! `dinrail canopen scan`: asks every node-id for its device type and identity.
 
-use super::super::{println, table};
+use super::super::{UsageError, println, table};
 use super::BusArgs;
 use super::bus::Bus;
 use dinrail_canopen::protocol::io::Outbox;
@@ -67,6 +67,10 @@ impl Asking {
 }
 
 pub fn run(args: &BusArgs, toml: bool, as_json: bool) -> anyhow::Result<()> {
+    if toml && as_json {
+        let both = "--json and --toml are two forms of one result: leave one of them out";
+        return Err(UsageError(both.to_owned()).into());
+    }
     let mut bus = Bus::open(args)?;
     let mut out = Outbox::default();
     // The master itself has no SDO server.
@@ -186,4 +190,16 @@ fn toml_text(f: &Asking) -> String {
         }
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::Which;
+
+    #[test]
+    fn one_form_at_a_time() {
+        let bus = BusArgs { bus: None, which: Which { stack: None } };
+        assert!(run(&bus, true, true).unwrap_err().is::<UsageError>());
+    }
 }

@@ -105,6 +105,10 @@ impl fmt::Display for Number {
 }
 
 impl Number {
+    /// As an identifier: what [`Self::integer`] gives, but true and false are none.
+    pub fn identifier(&self, node_id: u8) -> Option<i64> {
+        if matches!(self, Self::Bool(_)) { None } else { self.integer(node_id) }
+    }
     /// As an integer: `$NODEID` stands for the node's id. `None` when it is none.
     pub fn integer(&self, node_id: u8) -> Option<i64> {
         match self {
@@ -174,6 +178,8 @@ mod tests {
             (text("9223372036854775807+1"), None),
         ] {
             assert_eq!(number.integer(5), expected, "{number}");
+            let identifier = expected.filter(|_| !matches!(number, Number::Bool(_)));
+            assert_eq!(number.identifier(5), identifier, "{number}");
         }
     }
 }

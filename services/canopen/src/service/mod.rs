@@ -5,6 +5,7 @@ mod job_port;
 mod jobs;
 pub mod load;
 pub mod master;
+mod node_ids;
 mod outputs;
 mod ports;
 pub mod slave;

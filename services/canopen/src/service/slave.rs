@@ -5,7 +5,7 @@ mod jobs;
 
 use super::job_port::JobPort;
 use super::ports::{Ports, Search};
-use super::{EVENTS_A_SECOND, RunError, TAKE_FRAMES, addressing_near, load, plc_of};
+use super::{EVENTS_A_SECOND, RunError, TAKE_FRAMES, addressing_near, load, node_ids, plc_of};
 use crate::config::SlaveConfig as Config;
 use crate::device::Device;
 use crate::mistakes::Mistakes;
@@ -108,6 +108,7 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
     let (plc, addressing) = plc_of(stack, &me.wiring);
     let (_, _, mistakes) = planned(config, &stack.dir, addressing);
     let mut found: Vec<Finding> = mistakes.0.iter().map(|m| m.finding(name)).collect();
+    found.extend(node_ids::check_slave(config, stack, me));
     if config.bus.is_none() {
         found.extend(stack.check_only(name, "bus", "can"));
     }

@@ -43,6 +43,8 @@ pub(super) fn check(config: &Config, stack: &Stack, me: &str, findings: &mut Vec
     };
     if !mine(&service) {
         let (message, help) = match &service.wiring.plc {
+            // It lacks the key `plc`, which is told at its own table.
+            None if service.wiring.events.contains(&wanted.event) => return,
             Some(other) => (
                 format!("the inputs of '{}' go to '{other}', not to '{me}'", service.name),
                 format!("move the trigger to '{other}', or set plc = \"{me}\" in '{}'", service.name),
@@ -106,7 +108,9 @@ fn check_period(config: &Config, service: &ServiceEntry, me: &str, findings: &mu
 
 /// A program in which nothing waits for the event.
 pub(super) fn check_tasks(config: &Config, tasks: &[Task], me: &str, findings: &mut Vec<Finding>) {
+    // With `cycle`, which excludes the trigger and is told there, the implicit task is cyclic.
     if config.trigger.event().is_some()
+        && config.cycle.is_none()
         && !tasks.iter().any(|t| t.interval_ns.is_none() && t.single.is_none())
     {
         let message = format!(

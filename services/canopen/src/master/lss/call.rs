@@ -56,7 +56,7 @@ pub enum LssCall {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         timeout_ms: Option<u16>,
     },
-    /// Without address: the only device of the bus.
+    /// Without address, as in the next two: the only device of the bus. When several answer nothing is done.
     SetNodeId {
         node_id: u8,
         #[serde(default)]
@@ -89,8 +89,9 @@ fn index_of(kbit: u16) -> Option<u8> {
     BIT_TIMING_KBIT.iter().position(|&k| k == kbit && k != 0).map(|at| at as u8)
 }
 
+/// The serial number first: of several devices it is what differs, and none is asked more before they are found out.
 const INQUIRIES: [Inquiry; 5] =
-    [Inquiry::Vendor, Inquiry::Product, Inquiry::Revision, Inquiry::Serial, Inquiry::NodeId];
+    [Inquiry::Serial, Inquiry::Vendor, Inquiry::Product, Inquiry::Revision, Inquiry::NodeId];
 
 impl LssCall {
     /// What is wrong with its values, for the user.
@@ -142,6 +143,17 @@ impl LssCall {
         LssTimes { timeout_ms: self.timeout_ms().unwrap_or(times.timeout_ms), ..times }
     }
 
+    /// Whether it is for the only device, which nobody named: that no other answers has to be made sure first.
+    pub(super) fn is_sole(&self) -> bool {
+        matches!(
+            self,
+            Self::SetNodeId { address: None, .. }
+                | Self::SetBitrate { address: None, .. }
+                | Self::InquireDevice { address: None }
+                | Self::Inquire {}
+        )
+    }
+
     /// Whether all devices are to be waiting again at its end, however it ends.
     pub(super) fn tidies_up(&self) -> bool {
         match self {
@@ -160,6 +172,10 @@ impl LssCall {
             Some(address) => LssRequest::SwitchSelective(*address),
             None => LssRequest::SwitchGlobal(LssState::Configuration),
         };
+        // Who asks for the identity anyway finds out by that.
+        let alone = |address: &Option<LssAddress>| {
+            address.is_none().then_some(LssRequest::Inquire(Inquiry::Serial)).into_iter()
+        };
         let bit_timing = |kbit: u16| LssRequest::ConfigureBitTiming(index_of(kbit).unwrap_or(0));
         let store = |store: bool| store.then_some(LssRequest::Store);
         match *self {
@@ -177,13 +193,13 @@ impl LssCall {
             Self::Fastscan { hint, .. } => [LssRequest::Fastscan(hint)].into(),
             Self::Assign { .. } => [LssRequest::Fastscan(FastscanHint::default())].into(),
             Self::SetNodeId { node_id, ref address, store: keep } => {
-                let steps = [select(address), LssRequest::ConfigureNodeId(node_id)];
-                steps.into_iter().chain(store(keep)).collect()
+                let set = LssRequest::ConfigureNodeId(node_id);
+                [select(address)].into_iter().chain(alone(address)).chain([set]).chain(store(keep)).collect()
             }
             Self::SetBitrate { kbit, ref address, store: keep, activate_ms } => {
                 let activate = activate_ms.map(|delay_ms| LssRequest::ActivateBitTiming { delay_ms });
-                let steps = [select(address), bit_timing(kbit)];
-                steps.into_iter().chain(store(keep)).chain(activate).collect()
+                let steps = [select(address)].into_iter().chain(alone(address)).chain([bit_timing(kbit)]);
+                steps.chain(store(keep)).chain(activate).collect()
             }
             Self::InquireDevice { ref address } => {
                 [select(address)].into_iter().chain(INQUIRIES.map(LssRequest::Inquire)).collect()

@@ -1,6 +1,8 @@
 //! One call, service by service, to its end.
 
 use super::call::LssCall;
+use crate::protocol::cob_id::predefined;
+use crate::protocol::error_control::MS;
 use crate::protocol::io::Outbox;
 use crate::protocol::lss::master::{FastscanHint, Inquiry, LssMaster, LssRequest, LssResult, LssTimes};
 use crate::protocol::lss::{LssAddress, LssState, UNCONFIGURED};
@@ -29,6 +31,10 @@ pub enum LssError {
     Nobody(&'static str),
     #[error("{what}: the device refused: {}", reason(.what, *.code, *.specific))]
     Refused { what: &'static str, code: u8, specific: u8 },
+    #[error(
+        "several devices answer, and nothing says which one is meant (--sole; a job without `address`): `dinrail canopen lss fastscan --from NODE` gives the devices without node-id one each; --vendor, --product, --revision and --serial (`address`) name one"
+    )]
+    Several,
     #[error("devices answer, but none to its whole identity: frames are lost, or one is faulty")]
     Lost,
     #[error("no node-id is left for the device with serial {:#010X}", .0.serial)]
@@ -114,6 +120,8 @@ struct Run {
     current: Option<Found>,
     lost: u8,
     answered: bool,
+    /// A device answered; until then others may, and must not.
+    listen_ns: Option<u64>,
     /// How it ended; the devices are being sent back to waiting.
     end: Option<LssOutcome>,
 }
@@ -153,6 +161,7 @@ impl LssLine {
             current: None,
             lost: 0,
             answered: false,
+            listen_ns: None,
             end: None,
         });
         self.begin(now_ns, request);
@@ -177,7 +186,7 @@ impl LssLine {
     pub fn next_deadline(&self) -> Option<u64> {
         let run = self.run.as_ref()?;
         let late = run.end.is_none().then_some(run.deadline_ns);
-        self.master.next_deadline().into_iter().chain(late).min()
+        self.master.next_deadline().into_iter().chain(late).chain(run.listen_ns).min()
     }
 
     /// Sends what is due.
@@ -187,6 +196,11 @@ impl LssLine {
             if let Some(end) = self.fail(now_ns, LssError::Late) {
                 return Some(end);
             }
+        }
+        if self.run.as_mut().and_then(|run| run.listen_ns.take_if(|until| now_ns >= *until)).is_some()
+            && let Some(end) = self.go_on(now_ns)
+        {
+            return Some(end);
         }
         while let Some(result) = self.master.on_time(now_ns, out) {
             if let Some(end) = self.ended(now_ns, result) {
@@ -198,6 +212,9 @@ impl LssLine {
 
     /// A frame of the bus.
     pub fn on_frame(&mut self, t_ns: u64, frame: &CanFrame) -> Option<LssOutcome> {
+        if self.run.as_ref().is_some_and(|run| run.listen_ns.is_some()) && is_serial(frame) {
+            return self.fail(t_ns, LssError::Several);
+        }
         let result = self.master.on_frame(t_ns, frame)?;
         self.ended(t_ns, result)
     }
@@ -213,6 +230,16 @@ impl LssLine {
             Ok(()) => {}
             Err(error) => return self.fail(now_ns, error),
         }
+        if run.call.is_sole() && run.request == LssRequest::Inquire(Inquiry::Serial) {
+            let wait_ns = u64::from(run.call.times().timeout_ms) * MS;
+            run.listen_ns = Some(now_ns.saturating_add(wait_ns));
+            return None;
+        }
+        self.go_on(now_ns)
+    }
+
+    fn go_on(&mut self, now_ns: u64) -> Option<LssOutcome> {
+        let run = self.run.as_mut()?;
         match run.steps.pop_front() {
             Some(request) => {
                 self.begin(now_ns, request);
@@ -231,6 +258,7 @@ impl LssLine {
 
     fn finish(&mut self, now_ns: u64, result: Result<Value, LssError>) -> Option<LssOutcome> {
         let run = self.run.as_mut()?;
+        run.listen_ns = None;
         let found = if result.is_err() { std::mem::take(&mut run.found) } else { Vec::new() };
         let end = LssOutcome { result, found };
         if !run.call.tidies_up() {
@@ -255,6 +283,9 @@ impl Run {
                 return Ok(());
             }
             LssRequest::Fastscan(hint) => return self.scanned(hint, result),
+            LssRequest::Inquire(Inquiry::Serial) if self.call.is_sole() && self.call.tidies_up() => {
+                "asking for the serial number, to be sure that it is the only device"
+            }
             LssRequest::Inquire(_) => "asking for identity and node-id",
             LssRequest::ConfigureNodeId(_) => "setting the node-id",
             LssRequest::ConfigureBitTiming(_) => "setting the bit rate",
@@ -344,6 +375,10 @@ impl Run {
     fn found_json(&self) -> Value {
         self.found.iter().map(Found::json).collect()
     }
+}
+
+fn is_serial(frame: &CanFrame) -> bool {
+    frame.can_id == predefined::LSS_SLAVE && frame.payload().first() == Some(&(Inquiry::Serial as u8))
 }
 
 fn slot(inquiry: Inquiry) -> usize {

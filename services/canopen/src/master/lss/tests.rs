@@ -203,6 +203,54 @@ fn a_chosen_device_is_configured_and_asked() {
     assert_eq!(bus.call(range([3, 9])), Ok(json!({ "answered": false })));
 }
 
+/// The identity of nobody, a node-id given twice: nothing of that without an address.
+#[test]
+fn several_devices_are_refused_where_one_is_meant() {
+    let calls = [
+        json!({ "call": "set_node_id", "node_id": 33, "store": true }),
+        json!({ "call": "set_bitrate", "kbit": 250, "activate_ms": 20 }),
+        json!({ "call": "inquire_device" }),
+    ];
+    // Different ones, two with one identity, a configured one beside one without node-id.
+    let buses: [fn() -> Bus; 3] = [
+        || Bus::unconfigured([1, 2]),
+        || Bus::unconfigured([1, 1]),
+        || {
+            Bus::new(
+                [5, UNCONFIGURED].map(|id| LssSlave::new(address(id.into()), id, LssAbilities::default())),
+            )
+        },
+    ];
+    for (call, new) in calls.iter().flat_map(|call| buses.map(|new| (call, new))) {
+        let mut bus = new();
+        let before: Vec<u8> = bus.slaves.iter().map(LssSlave::pending_node_id).collect();
+        assert_eq!(bus.call(call.clone()), Err(LssError::Several), "{call}");
+        assert_eq!(bus.slaves.iter().map(LssSlave::pending_node_id).collect::<Vec<_>>(), before);
+        assert!(bus.all_wait());
+    }
+    let mut bus = Bus::unconfigured([1, 2]);
+    bus.call(json!({ "call": "switch_global", "state": "configuration" })).unwrap();
+    assert_eq!(bus.call(json!({ "call": "inquire" })), Err(LssError::Several));
+}
+
+#[test]
+fn the_only_device_needs_no_address() {
+    let mut bus = Bus::unconfigured([7]);
+    assert_eq!(bus.call(json!({ "call": "set_node_id", "node_id": 33 })), Ok(json!({ "node_id": 33 })));
+    assert_eq!(bus.call(json!({ "call": "set_bitrate", "kbit": 250 })), Ok(json!({ "kbit": 250 })));
+    let asked = bus.call(json!({ "call": "inquire_device" })).unwrap();
+    assert_eq!(
+        asked,
+        json!({ "vendor": 0x11, "product": 0x22, "revision": 0x33, "serial": 7, "node_id": 33 })
+    );
+    assert!(bus.all_wait());
+    // Who does not answer cannot be told from nobody, or from two.
+    bus.lose = |_, frame| frame.can_id == 0x7E4 && frame.data[0] == 0x5D;
+    let error = bus.call(json!({ "call": "set_node_id", "node_id": 34 })).unwrap_err();
+    insta::assert_snapshot!(error, @"asking for the serial number, to be sure that it is the only device: the device did not answer");
+    assert_eq!(bus.slaves[0].pending_node_id(), 33);
+}
+
 #[test]
 fn single_services_do_as_the_standard_says() {
     let mut bus = Bus::unconfigured([0xABCD]);

@@ -1,5 +1,6 @@
 //! Mistakes in what the table says of the master itself.
 
+use super::times;
 use crate::config::{MAX_NODES, MasterConfig as Config};
 use crate::mistakes::Mistakes;
 
@@ -20,6 +21,7 @@ pub(super) fn check_master(config: &Config, mistakes: &mut Mistakes) {
             "add [[service.node]]; `dinrail canopen scan --toml` finds them",
         );
     }
+    times::check_master(config, mistakes);
     if config.sync_overflow == 1 || config.sync_overflow > 240 {
         let message = format!("a SYNC counter cannot overflow at {}", config.sync_overflow);
         mistakes.add(

@@ -5,6 +5,7 @@
 mod check;
 mod image;
 mod pdo;
+mod times;
 mod value;
 mod writes;
 
@@ -38,6 +39,9 @@ pub struct NodePlan {
     pub pdos: Vec<Pdo>,
 }
 
+/// COB-IDs of the network's PDOs: whose it is, and the key that says so.
+type Taken = BTreeMap<u32, (String, Option<String>)>;
+
 /// Everything the service does.
 #[derive(Debug, Default)]
 pub struct Plan {
@@ -59,7 +63,7 @@ pub fn plan(config: &Config, devices: &BTreeMap<u8, Device>, addressing: Address
     let mut plan = Plan { settings: settings(config), ..Plan::default() };
     let period_ns = config.sync_period.map_or(0, |p| p.ns());
     plan.sync_window_ns = config.sync_window.map_or(period_ns, |w| w.ns());
-    let mut taken: BTreeMap<u32, String> = BTreeMap::new();
+    let mut taken = Taken::new();
     for (i, node) in config.nodes.iter().take(MAX_NODES).enumerate() {
         let key = format!("node[{i}]");
         if !(1..=127).contains(&node.id) {
@@ -116,8 +120,9 @@ struct One<'a> {
 }
 
 impl One<'_> {
-    fn node(&mut self, device: Option<&Device>, taken: &mut BTreeMap<u32, String>) -> NodePlan {
+    fn node(&mut self, device: Option<&Device>, taken: &mut Taken) -> NodePlan {
         let node = self.node;
+        times::check_node(node, self.key, self.mistakes);
         let name = node.name.clone().or_else(|| device.map(|d| d.name.clone())).unwrap_or_default();
         let mut settings = NodeSettings {
             plan: boot::Plan {
@@ -199,7 +204,7 @@ impl One<'_> {
         let node = self.node;
         let mut get = |check: Check, over: &Option<crate::config::Number>, key: &str, object: (u16, u8)| {
             if let Some(written) = over {
-                let value = written.integer(node.id).and_then(|v| u32::try_from(v).ok());
+                let value = written.identifier(node.id).and_then(|v| u32::try_from(v).ok());
                 if value.is_none() {
                     let message = format!("{written} is no 32-bit number");
                     self.mistakes.add(
@@ -226,18 +231,30 @@ impl One<'_> {
     }
 
     /// Two PDOs of the network with one COB-ID.
-    fn doubled(&mut self, pdos: &[Pdo], taken: &mut BTreeMap<u32, String>) {
+    fn doubled(&mut self, pdos: &[Pdo], taken: &mut Taken) {
         for pdo in pdos.iter().filter(|p| p.is_active() && (p.used || p.direction == Direction::Tpdo)) {
             let id = CobId(pdo.cob_id).can_id();
             let what = format!("{} {} of node {}", pdo.direction.name(), pdo.number, self.node.id);
-            if let Some(other) = taken.get(&id) {
+            let key = self.cob_id_key(pdo);
+            if let Some((other, key_of_other)) = taken.get(&id) {
                 let message =
                     format!("{what} and {other} have the same COB-ID {:03X}h", CobId(pdo.cob_id).id());
-                self.mistakes.add(self.key, message, "give one of them another with cob_id");
+                let key = key.as_ref().or(key_of_other.as_ref()).map_or(self.key, String::as_str);
+                self.mistakes.add(key, message, "give one of them another with cob_id");
             } else {
-                taken.insert(id, what);
+                taken.insert(id, (what, key));
             }
         }
+    }
+
+    /// Where the stack file writes the COB-ID of a PDO.
+    fn cob_id_key(&self, pdo: &Pdo) -> Option<String> {
+        let (table, written) = match pdo.direction {
+            Direction::Tpdo => ("tpdo", &self.node.tpdo),
+            Direction::Rpdo => ("rpdo", &self.node.rpdo),
+        };
+        let at = written.iter().position(|w| w.number == pdo.number && w.cob_id.is_some())?;
+        Some(format!("{}.{table}[{at}].cob_id", self.key))
     }
 }
 

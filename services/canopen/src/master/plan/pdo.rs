@@ -159,6 +159,8 @@ pub struct PdoPlanner<'a> {
     pub pdos: Vec<Pdo>,
     /// PDOs whose mapping this planner made: objects may be added to them.
     own: BTreeSet<(Direction, u16)>,
+    /// PDOs whose mapping the stack file writes.
+    written: BTreeSet<(Direction, u16)>,
 }
 
 impl<'a> PdoPlanner<'a> {
@@ -166,8 +168,8 @@ impl<'a> PdoPlanner<'a> {
     pub fn new(device: &'a Device, node: &Node, key: &str, has_sync: bool, mistakes: &mut Mistakes) -> Self {
         let mut pdos = defaults(device, Direction::Tpdo);
         pdos.extend(defaults(device, Direction::Rpdo));
-        let mut planner =
-            Self { device, node: node.id, key: key.to_owned(), has_sync, pdos, own: BTreeSet::new() };
+        let (own, written) = (BTreeSet::new(), BTreeSet::new());
+        let mut planner = Self { device, node: node.id, key: key.to_owned(), has_sync, pdos, own, written };
         for (direction, wanted) in [(Direction::Tpdo, &node.tpdo), (Direction::Rpdo, &node.rpdo)] {
             for (i, wanted) in wanted.iter().enumerate() {
                 let at = format!("{key}.{}[{i}]", direction.name().to_ascii_lowercase());
@@ -207,7 +209,7 @@ impl<'a> PdoPlanner<'a> {
             }
             mapping
         });
-        let cob_id = wanted.cob_id.as_ref().map(|n| (n, n.integer(self.node)));
+        let cob_id = wanted.cob_id.as_ref().map(|n| (n, n.identifier(self.node)));
         let pdo = &mut self.pdos[at];
         pdo.used = true;
         match cob_id {
@@ -215,8 +217,11 @@ impl<'a> PdoPlanner<'a> {
             Some((_, Some(id))) if (0..=0x7FF).contains(&id) && !is_restricted(id as u32) => {
                 pdo.cob_id = id as u32;
             }
-            Some((written, _)) => {
-                let message = format!("{written} is no COB-ID that a PDO may have");
+            Some((written, id)) => {
+                // Told in hex, as standards and help say it, also where the file says it in decimal.
+                let what =
+                    id.filter(|id| *id >= 0).map_or_else(|| written.to_string(), |id| format!("{id:X}h"));
+                let message = format!("{what} is no COB-ID that a PDO may have");
                 let help = "take 181h to 57Fh, or 680h to 6DFh (CiA 301 clause 7.3.5)";
                 mistakes.add(&format!("{key}.cob_id"), message, help);
             }
@@ -248,8 +253,12 @@ impl<'a> PdoPlanner<'a> {
             pdo.mapping = mapping;
         }
         let bits = pdo.bits();
-        if bits > PDO_BITS {
-            let message = format!("{} {} has {} bytes", direction.name(), wanted.number, bits.div_ceil(8));
+        if wanted.mapping.is_some() {
+            self.written.insert((direction, wanted.number));
+        }
+        if bits > PDO_BITS && wanted.mapping.is_some() {
+            let bytes = bits.div_ceil(8);
+            let message = format!("{} {} has {bytes} bytes by this mapping", direction.name(), wanted.number);
             mistakes.add(
                 &format!("{key}.mapping"),
                 message,
@@ -412,7 +421,7 @@ impl<'a> PdoPlanner<'a> {
                     "set sync_period, or transmission = \"event\" for this PDO",
                 );
             }
-            if pdo.bits() > PDO_BITS {
+            if pdo.bits() > PDO_BITS && !self.written.contains(&(pdo.direction, pdo.number)) {
                 let message = format!("{what} has {} bytes by its EDS", pdo.bits().div_ceil(8));
                 mistakes.add(&self.key, message, "give it another mapping of at most 8 bytes");
             }

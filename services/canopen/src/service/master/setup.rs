@@ -4,7 +4,7 @@ use crate::config::{MasterConfig as Config, Number, OnStop, OnStopWord};
 use crate::master::exchange::{RxPdo, transmission};
 use crate::master::plan::plan;
 use crate::service::outputs::values;
-use crate::service::{addressing_near, load, plc_of};
+use crate::service::{addressing_near, load, node_ids, plc_of};
 use ipc_types::stack::ServiceEntry;
 use ipc_types::topic::TopicKind;
 use ipc_types::wiring::{ImageRange, Neighbours, ServiceEvent, TopicDecl};
@@ -16,7 +16,7 @@ const RESULT_BYTES_A_NODE: u32 = 768;
 /// What the service needs of the launcher.
 pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
     let plc = neighbours.resolve("plc", config.plc.as_deref());
-    let (devices, _) = load::devices(config, &neighbours.dir);
+    let (devices, unread) = load::devices(config, &neighbours.dir);
     let plan = plan(config, &devices, addressing_near(neighbours, plc.as_deref()), &neighbours.name);
     let mut wiring = Wiring { plc, ..Wiring::default() };
     if !plan.inputs.is_empty() {
@@ -45,7 +45,9 @@ pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
         }
     }
     let synchronous = |pdo: &RxPdo| transmission::is_synchronous(pdo.transmission);
-    if plan.settings.sync_period_ns.is_some() && plan.exchange.rx.iter().any(synchronous) {
+    // Mistakes leave inputs out, and are told at their own place: the plc shall not miss the event besides.
+    let flawed = unread.iter().chain(&plan.mistakes).any(|m| !m.warning);
+    if plan.settings.sync_period_ns.is_some() && (flawed || plan.exchange.rx.iter().any(synchronous)) {
         wiring.events.push(ServiceEvent::Sync);
     }
     wiring.inputs = plan.inputs;
@@ -63,6 +65,7 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
     found.extend(safe_values(config, &me.wiring.outputs).err().map(|(key, message)| {
         Finding::error(name, &key, message, "name an address that a map entry takes from")
     }));
+    found.extend(node_ids::check_master(config, stack, me));
     if config.bus.is_none() {
         found.extend(stack.check_only(name, "bus", "can"));
     }
