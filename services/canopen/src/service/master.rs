@@ -8,7 +8,7 @@ mod setup;
 pub use setup::{check, topics};
 
 use super::job_port::JobPort;
-use super::ports::{Ports, Search};
+use super::ports::{Ports, Station};
 use super::{EVENTS_A_SECOND, RunError, TAKE_FRAMES, load, plc_of};
 use crate::config::{MasterConfig as Config, OnStop, OnStopWord};
 use crate::master::exchange::Exchange;
@@ -24,7 +24,7 @@ use ipc_types::event::Budget;
 use ipc_types::inputs::InputsPort;
 use ipc_types::outputs::{Change, Guard, Words, gather};
 use ipc_types::payload::{CanFrame, HealthState, Inputs};
-use ipc_types::turns::{Turn, Turns};
+use ipc_types::turns::Turns;
 use ipc_types::wiring::ImageRange;
 use ipc_types::{Context, clock};
 use jobs::Desk;
@@ -100,45 +100,21 @@ struct Service {
     sync_out_ns: (u64, u64),
 }
 
+impl Station for Service {
+    fn parts(&mut self) -> (&mut Ports, &mut Context) {
+        (&mut self.ports, &mut self.ctx)
+    }
+
+    fn publish(&mut self, fresh: bool) {
+        publish(&mut self.ports.inputs, &mut self.network.exchange, fresh);
+    }
+
+    fn status(&mut self) {
+        self.report();
+    }
+}
+
 impl Service {
-    fn introduce(&mut self) {
-        // Tells the plc that its inputs have no data yet, so that its first scan need not wait.
-        self.publish(true);
-        self.ctx.ready();
-        self.status();
-    }
-
-    /// Until the driver of the bus is there; false: the service shall end.
-    fn await_driver(&mut self, turns: &mut Turns) -> Result<bool, RunError> {
-        let mut search = Search::new(clock::mono_ns());
-        loop {
-            let now_ns = clock::mono_ns();
-            if self.ports.find_driver(&mut search, now_ns, &mut self.ctx) {
-                return Ok(true);
-            }
-            turns.come_again(search.next_ns(now_ns))?;
-            let due = turns.wait()?;
-            if due.stop {
-                return Ok(false);
-            }
-            turns.drain();
-            self.regular(due);
-        }
-    }
-
-    /// What comes with the heartbeat.
-    fn regular(&mut self, due: Turn) {
-        if due.beat {
-            self.ctx.beat();
-            if self.ports.inputs.is_due(clock::mono_ns()) {
-                self.publish(false);
-            }
-        }
-        if due.status {
-            self.status();
-        }
-    }
-
     fn begin(&mut self) {
         let now_ns = clock::mono_ns();
         self.network.start(now_ns, &mut self.out);
@@ -221,11 +197,6 @@ impl Service {
         if self.network.exchange.take_sample().is_some() {
             self.publish(true);
         }
-    }
-
-    /// `fresh`: news, so the plc is woken; otherwise a repetition.
-    fn publish(&mut self, fresh: bool) {
-        publish(&mut self.ports.inputs, &mut self.network.exchange, fresh);
     }
 
     fn take_image(&mut self) {

@@ -8,8 +8,10 @@ use ipc_types::payload::CanFrame;
 use ipc_types::port::{Publisher, Subscriber};
 use ipc_types::rail::RailError;
 use ipc_types::topic::TopicKind;
-use ipc_types::{Context, Wiring};
+use ipc_types::turns::{Turn, Turns};
+use ipc_types::{Context, Wiring, clock};
 use serde_json::{Value, json};
+use std::io;
 
 /// Frames that wait for room in the driver's queue; more are dropped and counted.
 const MAX_WAITING: usize = 1024;
@@ -97,6 +99,57 @@ impl Ports {
             tracing::warn!("{e}");
             Handed::On
         })
+    }
+}
+
+/// What master and slave do alike before they begin, and with each heartbeat.
+pub trait Station {
+    fn parts(&mut self) -> (&mut Ports, &mut Context);
+
+    /// Sends all inputs. `fresh`: news, so the plc is woken; otherwise a repetition.
+    fn publish(&mut self, fresh: bool);
+
+    /// Sends the status.
+    fn status(&mut self);
+
+    /// Tells the plc that its inputs have no data yet, so that its first scan need not wait.
+    fn introduce(&mut self) {
+        self.publish(true);
+        self.parts().1.ready();
+        self.status();
+    }
+
+    /// Until the driver of the bus is there; false: the service shall end.
+    fn await_driver(&mut self, turns: &mut Turns) -> io::Result<bool> {
+        let mut search = Search::new(clock::mono_ns());
+        loop {
+            let now_ns = clock::mono_ns();
+            let (ports, ctx) = self.parts();
+            if ports.find_driver(&mut search, now_ns, ctx) {
+                return Ok(true);
+            }
+            turns.come_again(search.next_ns(now_ns))?;
+            let due = turns.wait()?;
+            if due.stop {
+                return Ok(false);
+            }
+            turns.drain();
+            self.regular(due);
+        }
+    }
+
+    /// What comes with the heartbeat.
+    fn regular(&mut self, due: Turn) {
+        if due.beat {
+            let (ports, ctx) = self.parts();
+            ctx.beat();
+            if ports.inputs.is_due(clock::mono_ns()) {
+                self.publish(false);
+            }
+        }
+        if due.status {
+            self.status();
+        }
     }
 }
 

@@ -4,7 +4,7 @@ mod boot_up;
 mod jobs;
 
 use super::job_port::JobPort;
-use super::ports::{Ports, Search};
+use super::ports::{Ports, Station};
 use super::{EVENTS_A_SECOND, RunError, TAKE_FRAMES, addressing_near, load, node_ids, plc_of};
 use crate::config::SlaveConfig as Config;
 use crate::device::Device;
@@ -28,7 +28,7 @@ use ipc_types::payload::{CanFrame, Inputs, can_flag};
 use ipc_types::port::Subscriber;
 use ipc_types::stack::ServiceEntry;
 use ipc_types::topic::TopicKind;
-use ipc_types::turns::{Turn, Turns};
+use ipc_types::turns::Turns;
 use ipc_types::units::BitRate;
 use ipc_types::wiring::{Neighbours, TopicDecl};
 use ipc_types::{Context, Finding, Stack, Wiring, clock, plc_table};
@@ -238,44 +238,22 @@ struct Service {
     events: Budget,
 }
 
+impl Station for Service {
+    fn parts(&mut self) -> (&mut Ports, &mut Context) {
+        (&mut self.ports, &mut self.ctx)
+    }
+
+    fn publish(&mut self, fresh: bool) {
+        let header = Inputs { data_t_ns: self.data_t_ns, ranges: self.map.ranges(), ..Inputs::default() };
+        self.ports.inputs.publish(header, self.map.tail(), fresh);
+    }
+
+    fn status(&mut self) {
+        self.report();
+    }
+}
+
 impl Service {
-    fn introduce(&mut self) {
-        self.publish(true);
-        self.ctx.ready();
-        self.status();
-    }
-
-    /// Until the driver of the bus is there; false: the service shall end.
-    fn await_driver(&mut self, turns: &mut Turns) -> Result<bool, RunError> {
-        let mut search = Search::new(clock::mono_ns());
-        loop {
-            let now_ns = clock::mono_ns();
-            if self.ports.find_driver(&mut search, now_ns, &mut self.ctx) {
-                return Ok(true);
-            }
-            turns.come_again(search.next_ns(now_ns))?;
-            let due = turns.wait()?;
-            if due.stop {
-                return Ok(false);
-            }
-            turns.drain();
-            self.regular(due);
-        }
-    }
-
-    /// What comes with the heartbeat.
-    fn regular(&mut self, due: Turn) {
-        if due.beat {
-            self.ctx.beat();
-            if self.ports.inputs.is_due(clock::mono_ns()) {
-                self.publish(false);
-            }
-        }
-        if due.status {
-            self.status();
-        }
-    }
-
     fn begin(&mut self) {
         self.node.start(clock::mono_ns(), &mut self.out);
         self.after(clock::mono_ns());
@@ -433,12 +411,6 @@ impl Service {
         }
     }
 
-    /// `fresh`: news, so the plc is woken; otherwise a repetition.
-    fn publish(&mut self, fresh: bool) {
-        let header = Inputs { data_t_ns: self.data_t_ns, ranges: self.map.ranges(), ..Inputs::default() };
-        self.ports.inputs.publish(header, self.map.tail(), fresh);
-    }
-
     fn take_image(&mut self) {
         let Self { map, node, gathered, out, ports, .. } = self;
         let change = ports.image.take(|q, m| {
@@ -465,7 +437,7 @@ impl Service {
         self.send();
     }
 
-    fn status(&mut self) {
+    fn report(&mut self) {
         if let Some(left_out) = self.events.renew() {
             let message = format!("{left_out} more events in the last second left out");
             self.ctx.event(EventKind::NodeState, Level::Warning, message, Value::Null);

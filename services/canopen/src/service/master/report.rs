@@ -112,7 +112,7 @@ impl Service {
         })
     }
 
-    pub(super) fn status(&mut self) {
+    pub(super) fn report(&mut self) {
         if let Some(left_out) = self.events.renew() {
             let message = format!("{left_out} more events in the last second left out");
             self.ctx.event(EventKind::NodeState, Level::Warning, message, Value::Null);
