@@ -1,5 +1,5 @@
 //! From what every service declares to the rail as the launcher creates it: each topic with its writers, its
-//! readers, whom it wakes under which event id, and its limits.
+//! readers, whom it wakes, and its limits.
 
 use super::document::{Document, Service};
 use super::nearest::nearest;
