@@ -6,6 +6,7 @@ use crate::payload::{Event, Health, HealthState, Payload, Status};
 use crate::port::{Publisher, RawSubscriber, Subscriber, raw_subscriber};
 use crate::rail::{self, RailError, STACK_FILE, Svc};
 use crate::reactor::signals;
+use crate::reserve::reserve;
 use crate::stack::{ServiceEntry, Stack, TopicEntry};
 use crate::topic::{EVENTS, TopicKind};
 use iceoryx2::node::Node;
@@ -156,8 +157,15 @@ impl Context {
         self.shutdown.as_fd()
     }
 
-    /// Says that the service works now; call once after the last port is open.
+    /// Says that the service works now; call once after the last port is open. Its memory is set aside before that: from
+    /// now on a full /dev/shm does it no harm.
     pub fn ready(&mut self) {
+        if let Some(shm) = self.stack.root.parent()
+            && let Ok(reserved) = reserve(shm, &self.stack.prefix)
+            && let Some(complaint) = reserved.complaint()
+        {
+            self.event(EventKind::NoRoom, Level::Fault, complaint, serde_json::Value::Null);
+        }
         self.set_state(HealthState::Ready);
     }
 

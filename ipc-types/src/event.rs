@@ -28,9 +28,12 @@ pub enum EventKind {
     Restarting,
     /// The restart budget is used up; the service is held.
     Held,
+    /// A service dies again and again, too seldom to use up its restart budget; as information: it does no longer.
+    Unstable,
     /// The stack ends because of a service.
     StackFailed,
-    /// /dev/shm is full: what died cannot be cleaned up and started again until there is room.
+    /// /dev/shm is full: what died cannot be cleaned up and started again until there is room, or memory of the stack
+    /// could not be set aside.
     NoRoom,
     /// The stack is being stopped.
     Stopping,
@@ -48,6 +51,8 @@ pub enum EventKind {
     ProgramFault,
     /// Variables are forced, or no longer.
     Forced,
+    /// The RETAIN variables cannot be copied to disk, or can again.
+    RetainFault,
     /// An input became bad or good.
     InputQuality,
     /// The recorder lost messages or could not write.

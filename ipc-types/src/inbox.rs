@@ -11,7 +11,7 @@
 use crate::rail::RailError;
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
-use std::os::unix::net::{SocketAddr, UnixDatagram};
+use std::os::unix::net::UnixDatagram;
 use std::path::{Path, PathBuf};
 
 /// The socket of a service's inbox.
@@ -63,25 +63,61 @@ impl Inbox {
 /// The ringing end to one inbox.
 #[derive(Debug)]
 pub struct Bell {
+    /// Connected to the inbox of the consumer that was last there: looking its path up at each ring costs a fifth of it.
     socket: UnixDatagram,
-    /// Looked up at each ring: a restarted consumer has another socket there.
-    inbox: SocketAddr,
+    inbox: PathBuf,
 }
 
 impl Bell {
     pub(crate) fn open(root: &Path, service: &str) -> Result<Self, RailError> {
         let socket = UnixDatagram::unbound()?;
         socket.set_nonblocking(true)?;
-        Ok(Self { socket, inbox: SocketAddr::from_pathname(place(root, service))? })
+        Ok(Self { socket, inbox: place(root, service) })
     }
 
     /// Wakes the consumer. A dead one is no error: its successor reads the queue when it starts. Nor is a full socket:
     /// there are rings in it.
     pub fn ring(&self) {
-        while let Err(e) = self.socket.send_to_addr(&[1], &self.inbox) {
-            if e.kind() != io::ErrorKind::Interrupted {
-                return;
+        let mut looked_up = false;
+        while let Err(e) = self.socket.send(&[1]) {
+            match e.kind() {
+                io::ErrorKind::Interrupted => {}
+                io::ErrorKind::WouldBlock => return,
+                // Not connected yet, or to one that is gone: a restarted consumer has another socket in its place.
+                _ if !looked_up && self.socket.connect(&self.inbox).is_ok() => looked_up = true,
+                _ => return,
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may end like this")]
+    use super::*;
+
+    #[test]
+    fn a_bell_finds_the_successor_and_rings_that_meet_a_full_socket_wake_as_well() {
+        let root = std::env::temp_dir().join(format!("dinrail-inbox-{}", std::process::id()));
+        std::fs::create_dir_all(&root).unwrap();
+        let bell = Bell::open(&root, "plc").unwrap();
+        bell.ring();
+        let mut first = Inbox::open(&root, "plc").unwrap();
+        assert!(!first.drain(), "what rang before is not there");
+        bell.ring();
+        assert!(first.drain() && !first.drain());
+        // More than any socket holds.
+        (0..100_000).for_each(|_| bell.ring());
+        assert!(first.drain() && !first.drain());
+        bell.ring();
+        drop(first);
+        bell.ring();
+        for _ in 0..3 {
+            let mut next = Inbox::open(&root, "plc").unwrap();
+            assert!(!next.drain());
+            bell.ring();
+            assert!(next.drain());
+        }
+        std::fs::remove_dir_all(&root).unwrap();
     }
 }

@@ -64,6 +64,7 @@ pub mod plc_table;
 pub mod port;
 pub mod rail;
 pub mod reactor;
+pub mod reserve;
 pub mod scan_record;
 pub mod stack;
 #[cfg(feature = "testing")]

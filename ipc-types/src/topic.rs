@@ -160,7 +160,7 @@ impl TopicKind {
             Self::Results => row("results", JobResult::NAME, 64, 4096, Oldest, false, true),
             Self::Health => row("health", Health::NAME, 4, 0, Oldest, true, false),
             Self::Status => row("status", Status::NAME, 4, 16384, Oldest, true, true),
-            Self::Events => row("events", Event::NAME, 256, 8192, Oldest, false, true),
+            Self::Events => row("events", Event::NAME, 256, 2048, Oldest, false, true),
         }
     }
 

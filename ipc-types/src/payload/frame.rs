@@ -108,8 +108,8 @@ impl CanFrame {
 pub mod serial_flag {
     /// On `rx`: these bytes were sent by a process of the stack and have left the port.
     pub const TX_ECHO: u32 = 1;
-    /// The chunk ends a frame: the line was silent behind it (framing `rtu`, `silence`), or its delimiter or
-    /// length was reached. Absent: the frame goes on in the next chunk.
+    /// The chunk ends a frame: the line was silent behind it (framing `rtu`, `silence`), its delimiter or length
+    /// was reached, or it is an awaited answer ([`EXPECT_ANSWER`]). Absent: the frame goes on in the next chunk.
     pub const END: u32 = 2;
     /// A silence of more than 1.5 characters lay inside the frame (serial line guide V1.02, 2.5.1.1).
     pub const GAP: u32 = 4;
@@ -125,6 +125,9 @@ pub mod serial_flag {
     pub const NOT_SENT: u32 = 128;
     /// On `tx`: start at once, without waiting until the line was silent for 3.5 characters.
     pub const AT_ONCE: u32 = 256;
+    /// On `tx`, framing `rtu`: a request of a Modbus master. Its answer ends as soon as it is whole, without a silence
+    /// behind it; the silence before the next transmission is kept all the same.
+    pub const EXPECT_ANSWER: u32 = 512;
     /// Every flag that tells of a damaged frame.
     pub const DAMAGED: u32 = PARITY | FRAMING | OVERRUN | BREAK;
 }

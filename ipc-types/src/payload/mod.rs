@@ -21,7 +21,7 @@ pub use image::{
     AckEntry, Image, ImageWrite, Inputs, MAX_ACKS, PART_BYTES, PlcState, Quality, ScanPart, acks,
 };
 pub use plumbing::{Encoding, Payload, Stamp, as_bytes, from_bytes};
-pub use service::{Event, Health, HealthState, Job, JobResult, Status};
+pub use service::{Event, Health, HealthState, Job, JobResult, Status, event_flag};
 
 use plumbing::payload;
 #[cfg(target_endian = "big")]

@@ -47,11 +47,18 @@ payload! {
     }
 }
 
+/// Bits of [`Event::flags`].
+pub mod event_flag {
+    /// Said before, when a recorder was not there to hear it; the stamp says when it happened. Who reads the rail live
+    /// passes it over, and so does who was there already at the time of its stamp.
+    pub const AGAIN: u32 = 1;
+}
+
 payload! {
     /// Something happened, on `stack/events`. Tail: JSON, see [`crate::event::EventBody`].
     pub struct Event: "dinrail.Event/1", tail, Json {
-        /// Reserved, 0.
-        pub reserved: u32,
+        /// [`event_flag`]s.
+        pub flags: u32,
         /// Bytes of the tail.
         pub n: u32,
     }
