@@ -9,13 +9,11 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 use support::canopen::{
-    DEVICE_PROGRAM, DEVICES, becomes, exchanges, log_has, long_value, object as object_of, path, refused,
-    there_and_back,
+    DEVICE_PROGRAM, DEVICES, IO401, becomes, durand, eight_without_node_id, exchanges, fastscan_finds_eight,
+    log_has, long_value, object as object_of, path, python_slave, refused, there_and_back, with_durand_eds,
 };
 use support::peers::{Peer, peer, program};
-use support::{Scratch, Stack, free_port, skip};
-
-const EDS: &str = include_str!("../launcher/stacks/canopen-io/io401.eds");
+use support::{Stack, free_port, skip};
 
 /// Ports of the servers of a bus.
 struct Ports {
@@ -62,7 +60,7 @@ fn python_canopen_as_master_drives_our_devices() {
         return;
     }
     let text = format!("{}{DEVICES}", ports.bus());
-    let mut stack = Stack::up("copymaster", &text, &[("io401.eds", EDS), ("main.st", DEVICE_PROGRAM)]);
+    let mut stack = Stack::up("copymaster", &text, &[("io401.eds", IO401), ("main.st", DEVICE_PROGRAM)]);
     let eds = stack.scratch.0.join("io401.eds");
     let parts = ["nmt", "heartbeat_consumer", "sdo", "pdo"];
     let mut master = python_master(&ports, "cannelloni", &eds, &parts).unwrap();
@@ -95,23 +93,14 @@ fn python_canopen_as_master_drives_our_devices() {
     assert_eq!(stack.take_down(), 0, "{}", stack.log());
 }
 
-fn eight_without_node_id(ports: &Ports) -> String {
-    let mut text = ports.bus();
-    for serial in 1..=8 {
-        text.push_str(&format!(
-            "\n[[service]]\nname = \"device{serial}\"\nkind = \"canopen-slave\"\nnode_id = 255\nsimulate = \"401\"\nserial_number = {serial}\n"
-        ));
-    }
-    text
-}
-
 #[test]
 fn eight_devices_without_node_id_are_found_by_python_canopen() {
     let ports = Ports::new();
     if peer("canopen_master.py").is_none() {
         return;
     }
-    let stack = Stack::up("colsspy", &eight_without_node_id(&ports), &[("io401.eds", EDS)]);
+    let text = ports.bus() + &eight_without_node_id();
+    let stack = Stack::up("colsspy", &text, &[("io401.eds", IO401)]);
     let eds = stack.scratch.0.join("io401.eds");
     let mut master = python_master(&ports, "cannelloni", &eds, &["fastscan"]).unwrap();
     master.says("fastscan");
@@ -120,12 +109,8 @@ fn eight_devices_without_node_id_are_found_by_python_canopen() {
 
 #[test]
 fn eight_devices_without_node_id_are_found_by_the_command_line() {
-    let stack = Stack::up("colsscli", &eight_without_node_id(&Ports::new()), &[]);
-    let found = stack.ok(&["canopen", "lss", "fastscan", "--from", "10"]);
-    for serial in 1..=8 {
-        let line = format!("serial 0x{serial:08X}  -> node-id {}", 9 + serial);
-        assert!(found.contains(&line), "{line} is not in\n{found}");
-    }
+    let stack = Stack::up("colsscli", &(Ports::new().bus() + &eight_without_node_id()), &[]);
+    fastscan_finds_eight(&stack, 10, 1, &[]);
     let scanned = stack.ok(&["canopen", "scan"]);
     for node in 10..=17 {
         let row = scanned.lines().find(|l| l.starts_with(&node.to_string())).unwrap_or_default();
@@ -155,11 +140,9 @@ cycle = "10ms"
     )
 }
 
-fn python_slave(ports: &Ports, stack: &Stack, node: u8) -> Peer {
-    let mut command = peer("canopen_slave.py").unwrap();
-    command.arg(&ports.cannelloni).arg(stack.scratch.0.join("io401.eds"));
-    command.args([node.to_string(), node.to_string()]);
-    let mut peer = Peer::start(command);
+/// As [`python_slave`], on the bus already.
+fn python_node(ports: &Ports, stack: &Stack, node: u8) -> Peer {
+    let mut peer = python_slave(&ports.cannelloni, &stack.scratch.0.join("io401.eds"), node);
     peer.says("ready");
     peer
 }
@@ -205,10 +188,10 @@ fn our_master_drives_devices_made_of_python_canopen() {
         return;
     }
     let ports = Ports::new();
-    let mut stack = Stack::spawn("copyslave", &our_master(&ports, PYTHON_NODES), &[("io401.eds", EDS)]);
+    let mut stack = Stack::spawn("copyslave", &our_master(&ports, PYTHON_NODES), &[("io401.eds", IO401)]);
     stack.wait("the bus at work", || stack.is_ready("can0").then_some(()));
-    let mut first = python_slave(&ports, &stack, 10);
-    let mut second = python_slave(&ports, &stack, 11);
+    let mut first = python_node(&ports, &stack, 10);
+    let mut second = python_node(&ports, &stack, 11);
     // Boot-up: identity, configuration, start.
     first.says("written 2001:00 feca0000");
     first.says("operational 0xcafe");
@@ -286,9 +269,9 @@ map = [
         pairs.push((format!("%QW{word}"), format!("%IW{word}")));
     }
     let pairs: Vec<(&str, &str)> = pairs.iter().map(|(q, i)| (q.as_str(), i.as_str())).collect();
-    let mut stack = Stack::spawn("copykinds", &our_master(&ports, &nodes), &[("io401.eds", EDS)]);
+    let mut stack = Stack::spawn("copykinds", &our_master(&ports, &nodes), &[("io401.eds", IO401)]);
     stack.wait("the bus at work", || stack.is_ready("can0").then_some(()));
-    let devices: Vec<Peer> = KINDS.iter().map(|(id, ..)| python_slave(&ports, &stack, *id)).collect();
+    let devices: Vec<Peer> = KINDS.iter().map(|(id, ..)| python_node(&ports, &stack, *id)).collect();
     for state in 30..34 {
         becomes(&stack, &format!("%IB{state}"), 5);
     }
@@ -314,7 +297,7 @@ fn comes_and_goes(stack: &Stack, ports: &Ports, first: Peer, second: &mut Peer) 
     log_has(stack, "node 10 (Simulated I/O) is lost: it sends no heartbeat any more");
     becomes(stack, "%IB30", 0);
     becomes(stack, "%IB31", 5);
-    let mut first = python_slave(ports, stack, 10);
+    let mut first = python_node(ports, stack, 10);
     first.says("operational 0xcafe");
     becomes(stack, "%IB30", 5);
     exchanges(stack, &[("%QB0", "%IB0"), ("%QB1", "%IB1")]);
@@ -345,31 +328,15 @@ map = [
 ]
 "#;
 
-/// A scratch folder with the EDS that durand makes of the device.
-fn with_durand_eds() -> Option<Scratch> {
-    let output = peer("durand_slave.py")?.arg("eds").output().unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let scratch = Scratch::new("durand");
-    scratch.write("durand.eds", output.stdout);
-    Some(scratch)
-}
-
-fn durand(ports: &Ports, node: u8) -> Peer {
-    let mut command = peer("durand_slave.py").unwrap();
-    command.args([ports.cannelloni.as_str(), &node.to_string(), "12"]);
-    let mut peer = Peer::start(command);
-    peer.says("ready");
-    peer
-}
-
 #[test]
 fn our_master_drives_devices_made_of_durand() {
-    let Some(scratch) = with_durand_eds() else { return };
+    let Some(scratch) = with_durand_eds("durand") else { return };
     let ports = Ports::new();
     let stack = Stack::spawn_in("codurand", &our_master(&ports, DURAND_NODE), scratch, &[]);
     stack.wait("the bus at work", || stack.is_ready("can0").then_some(()));
     // It has no node-id yet: LSS gives it one, and the master boots it.
-    let first = durand(&ports, 255);
+    let mut first = durand(&ports.cannelloni, 255, [12]);
+    first.says("ready");
     let found = stack.ok(&["canopen", "lss", "fastscan", "--from", "12"]);
     assert!(
         found.contains(
@@ -382,7 +349,8 @@ fn our_master_drives_devices_made_of_durand() {
     drop(first);
     log_has(&stack, "node 12 (Durand) is lost: it sends no heartbeat any more");
     becomes(&stack, "%IB32", 0);
-    let mut second = durand(&ports, 12);
+    let mut second = durand(&ports.cannelloni, 12, [12]);
+    second.says("ready");
     becomes(&stack, "%IB32", 5);
     exchanges(&stack, &[("%QB2", "%IB2"), ("%QW4", "%IW4")]);
     assert_eq!(stack.ok(&["canopen", "sdo", "read", "12", "Number"]).trim(), "2001:00 Number = 4711");
@@ -404,17 +372,14 @@ fn our_master_drives_devices_made_of_durand() {
 
 #[test]
 fn eight_devices_made_of_durand_without_node_id_are_found_by_our_master() {
-    let Some(mut command) = peer("durand_slave.py") else { return };
+    if peer("durand_slave.py").is_none() {
+        return;
+    }
     let ports = Ports::new();
     let stack = Stack::up("codurand8", &our_master(&ports, ""), &[]);
-    command.args([&ports.cannelloni, "255"]).args((101..=108).map(|serial| serial.to_string()));
-    let mut devices = Peer::start(command);
+    let mut devices = durand(&ports.cannelloni, 255, 101..=108);
     devices.says("ready");
-    let found = stack.ok(&["canopen", "lss", "fastscan", "--from", "20"]);
-    for serial in 101..=108 {
-        let line = format!("serial 0x{serial:08X}  -> node-id {}", serial - 101 + 20);
-        assert!(found.contains(&line), "{line} is not in\n{found}");
-    }
+    fastscan_finds_eight(&stack, 20, 101, &[]);
     for node in 20..28 {
         let said = stack.ok(&["canopen", "sdo", "read", &node.to_string(), "1018:04", "--type", "u32"]);
         assert!(said.trim().ends_with(&format!("= {}", node - 20 + 101)), "{said}");
@@ -479,7 +444,7 @@ fn our_master_drives_a_device_made_of_node_canopen() {
         return;
     }
     let ports = Ports::new();
-    let stack = Stack::spawn("conode", &our_master(&ports, NODE_NODE), &[("io401.eds", EDS)]);
+    let stack = Stack::spawn("conode", &our_master(&ports, NODE_NODE), &[("io401.eds", IO401)]);
     stack.wait("the bus at work", || stack.is_ready("can0").then_some(()));
     let start = || {
         let mut command = node_canopen().unwrap();

@@ -6,15 +6,20 @@ mod support;
 
 use rustix::process::Signal;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 use support::canopen::{
-    DEVICE_PROGRAM, DEVICES, HELD, IO401, becomes, exchanges, log_has, slave, status, there_and_back,
+    DEVICE_PROGRAM, DEVICES, HELD, IO401, back, becomes, durand, eight_without_node_id, exchanges,
+    fastscan_finds_eight, log_has, long_value, python_slave, slave, status, there, there_and_back,
+    with_durand_eds,
 };
 use support::peers::{Peer, peer};
 use support::uml::{guest_work, in_guest};
 use support::{Scratch, Stack, dinrail, wait_for};
+
+/// The guest's interface.
+const VCAN: &str = "vcan0";
 
 /// The guest is slow, and its machine is shared.
 const LONG: Duration = Duration::from_mins(2);
@@ -127,12 +132,16 @@ struct Witness {
 }
 
 impl Witness {
-    fn candump() -> Self {
+    /// Of these identifiers, all if there are none.
+    fn candump(identifiers: &[&str]) -> Self {
         // Left to be read where the test fails.
         let path = guest_work().join("candump.log");
         let mut command = Command::new("candump");
+        let filters: String = identifiers.iter().map(|id| format!(",{id}:7FF")).collect();
+        // The frames by which it is seen to hear.
+        let own = if filters.is_empty() { "" } else { ",6FE:7FF" };
         // A receive buffer that lets it sleep for seconds on this one processor.
-        command.args(["-r", "33554432", "-L", "vcan0"]);
+        command.args(["-r", "33554432", "-L", &format!("{VCAN}{filters}{own}")]);
         Self::start(command, path)
     }
 
@@ -187,19 +196,7 @@ impl Drop for Witness {
 }
 
 fn cansend(frame: &str) {
-    assert!(Command::new("cansend").args(["vcan0", frame]).status().unwrap().success());
-}
-
-fn python_slave(eds: &Path, node: u8) -> Peer {
-    let mut command = peer("canopen_slave.py").unwrap();
-    command.arg("vcan0").arg(eds).args([node.to_string(), node.to_string()]);
-    Peer::start(command)
-}
-
-fn durand() -> Peer {
-    let mut command = peer("durand_slave.py").unwrap();
-    command.args(["vcan0", "12", "12"]);
-    Peer::start(command)
+    assert!(Command::new("cansend").args([VCAN, frame]).status().unwrap().success());
 }
 
 /// NMT states of nodes, where the program sees them.
@@ -223,15 +220,12 @@ fn our_master_drives_our_nodes_and_foreign_ones_over_the_kernel() {
 }
 
 fn our_master() {
-    let Some(mut eds_of_durand) = peer("durand_slave.py") else { return };
-    let scratch = Scratch::new("vcmaster");
+    let Some(scratch) = with_durand_eds("vcmaster") else { return };
     let eds = scratch.write("io401.eds", IO401);
-    let candump = Witness::candump();
+    let candump = Witness::candump(&[]);
     // Interpreters start while other things do.
-    let (mut first, mut second, mut third) = (python_slave(&eds, 10), python_slave(&eds, 11), durand());
-    let output = eds_of_durand.arg("eds").output().unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    scratch.write("durand.eds", output.stdout);
+    let [mut first, mut second] = [10, 11].map(|node| python_slave(VCAN, &eds, node));
+    let mut third = durand(VCAN, 12, [12]);
     let devices =
         [BUS, &slave("n2", 2, &format!("serial_number = 7\n{HELD}")), &slave("n3", 3, HELD)].concat();
     let mut nodes = timed("our nodes", || Stack::up("vcnodes", &devices, &[]));
@@ -402,7 +396,7 @@ fn comes_and_goes(nodes: &Stack, master: &Stack, candump: &Witness, first: Peer,
     states(master, &["%IB31", "%IB34"], 5);
     let (boot_ups, starts) = (candump.count("702#00"), candump.count("000#0102"));
     nodes.ok(&["restart", "n2"]);
-    let mut first = python_slave(&master.scratch.0.join("io401.eds"), 10);
+    let mut first = python_slave(VCAN, &master.scratch.0.join("io401.eds"), 10);
     second.tell("speak");
     first.says("operational 0xcafe");
     states(master, &["%IB30", "%IB31", "%IB32", "%IB33", "%IB34"], 5);
@@ -426,11 +420,11 @@ fn python_master() {
     let scratch = Scratch::new("vcdevices");
     let eds = scratch.write("io401.eds", IO401);
     scratch.write("main.st", DEVICE_PROGRAM);
-    let candump = Witness::candump();
+    let candump = Witness::candump(&[]);
     let mut stack = Stack::spawn_in("vcdevices", &[BUS, DEVICES].concat(), scratch, &[]);
     timed("our devices", || stack.wait_ready());
     let parts = ["nmt", "heartbeat_consumer", "sdo", "pdo", "rtr", "device"];
-    command.args(["socketcan", "vcan0"]).arg(eds).args(parts);
+    command.args(["socketcan", VCAN]).arg(eds).args(parts);
     let mut master = Peer::start(command);
     for part in &parts[..5] {
         timed(part, || master.says(part));
@@ -456,5 +450,35 @@ fn python_master() {
     ] {
         candump.hears(start);
     }
+    assert_eq!(stack.take_down(), 0, "{}", stack.log());
+}
+
+#[test]
+fn eight_devices_get_node_ids_and_one_a_megabyte_over_the_kernel() {
+    in_guest("eight_devices_get_node_ids_and_one_a_megabyte_over_the_kernel", eight_devices);
+}
+
+fn eight_devices() {
+    const ALONE: &str = "\n[[service]]\nname = \"io\"\nkind = \"canopen-master\"\nsdo_timeout = \"2s\"\n";
+    let text = [BUS, ALONE, &eight_without_node_id()].concat();
+    let mut stack = timed("eight devices", || Stack::up("vceight", &text, &[]));
+    // Eight processes answer on one processor.
+    timed("fastscan", || fastscan_finds_eight(&stack, 10, 1, &["--timeout", "200"]));
+    let scanned = stack.ok(&["canopen", "scan"]);
+    assert!((10..=17).all(|node| scanned.lines().any(|l| l.starts_with(&node.to_string()))), "{scanned}");
+    // Of each direction what the receiver says is heard: 1200 frames of 150,000.
+    let value = long_value(1 << 20);
+    let server = Witness::candump(&["58A"]);
+    timed("a megabyte there", || there(&stack, "10", &value, "block"));
+    // With CRC, and sub-blocks of 127 segments; 149,797 segments are 1180 sub-blocks.
+    server.hears("58A#A4002000");
+    server.hears("58A#A100000000000000");
+    assert!(server.count("58A#A27F7F") >= 1179, "{}", server.count("58A#A2"));
+    drop(server);
+    let client = Witness::candump(&["60A"]);
+    timed("and back", || back(&stack, "10", &value, "block"));
+    client.hears("60A#A40020007F");
+    client.hears("60A#A100000000000000");
+    assert!(client.count("60A#A27F7F") >= 1179, "{}", client.count("60A#A2"));
     assert_eq!(stack.take_down(), 0, "{}", stack.log());
 }

@@ -52,6 +52,8 @@ fn a_real_car_is_decoded_by_the_program_read_by_modbus_and_recorded_frame_by_fra
                 "-t",
                 "4",
                 "-1",
+                "-o",
+                "10",
                 "127.0.0.1",
             ])
             .output()

@@ -45,6 +45,8 @@ cycle = "5ms"
 [[service]]
 name = "modbus"
 kind = "modbus-server"
+# A machine with much to do may keep the plc from its turn for the 0.2 s that are the default.
+stale_after = "10s"
 tcp = {{ address = "127.0.0.1", port = {tcp} }}
 rtu_over_tcp = {{ address = "127.0.0.1", port = {rtu_over_tcp}, unit = [1, 5] }}
 serial = [
@@ -125,8 +127,11 @@ fn foreign_masters_on_every_transport() {
 fn mbpoll(args: &[&str]) {
     let Some(mut mbpoll) = peers::program("mbpoll", "mbpoll") else { return };
     let (target, options) = args.split_last().unwrap();
-    let output =
-        mbpoll.args(options).args(["-0", "-r", "7", "-c", "1", "-t", "4", "-1", target]).output().unwrap();
+    let output = mbpoll
+        .args(options)
+        .args(["-0", "-r", "7", "-c", "1", "-t", "4", "-1", "-o", "10", target])
+        .output()
+        .unwrap();
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
     assert!(
         text.contains("[7]: \t4711"),

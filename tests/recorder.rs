@@ -8,11 +8,13 @@ use rustix::process::Signal;
 use serde_json::Value;
 use std::path::Path;
 use std::thread::sleep;
-use std::time::Duration;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use support::socketcand::Load;
 use support::{Scratch, Stack, dinrail, free_port, peers};
 
 const KILLS: usize = 50;
+/// More bytes than a recording of these stacks has before its first frame: with a keyframe some 30 KiB.
+const BEGINNING: u64 = 96 << 10;
 
 fn text(can_port: u16) -> String {
     format!(
@@ -55,6 +57,15 @@ fn span(recording: &Path) -> Option<(i64, i64)> {
     Some((frames["first_ns"].as_i64()?, frames["last_ns"].as_i64()?))
 }
 
+/// Waits until so many files are there and the last of them holds more than its beginning: frames.
+fn recorded(stack: &Stack, files: usize) {
+    stack.wait(&format!("frames in file {files}"), || {
+        let all = stack.recordings();
+        let size = all.last().and_then(|file| file.metadata().ok()).map_or(0, |m| m.len());
+        (all.len() == files && size > BEGINNING).then_some(())
+    });
+}
+
 #[test]
 fn fifty_kills_under_20_000_frames_a_second_lose_little_and_every_file_is_made_whole() {
     let can_port = free_port();
@@ -63,16 +74,19 @@ fn fifty_kills_under_20_000_frames_a_second_lose_little_and_every_file_is_made_w
     stack.wait_ready();
     let load = Load::start(can_port, 20_000);
     let mut random = 88_172_645_463_325_252_u64;
-    for _ in 0..KILLS {
+    let mut killed_ns = Vec::new();
+    for kill in 0..KILLS {
+        recorded(&stack, kill + 1);
         random ^= random << 13;
         random ^= random >> 7;
         random ^= random << 17;
-        sleep(Duration::from_millis(150 + random % 400));
+        sleep(Duration::from_millis(random % 400));
         let generation = stack.generation("rec");
         stack.kill("rec", Signal::KILL);
+        killed_ns.push(SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_nanos() as i64);
         stack.wait_generation_above("rec", generation);
     }
-    sleep(Duration::from_millis(500));
+    recorded(&stack, KILLS + 1);
     load.end();
     stack.wait("the last cut file is made whole", || {
         let files = stack.recordings();
@@ -86,13 +100,19 @@ fn fifty_kills_under_20_000_frames_a_second_lose_little_and_every_file_is_made_w
     for recording in &recordings {
         assert_eq!(info(recording)["finished"], true, "{}", recording.display());
     }
-    let spans: Vec<_> = recordings.iter().filter_map(|r| span(r)).collect();
-    assert!(spans.len() > KILLS * 9 / 10, "only {} files with frames", spans.len());
-    let mut gaps: Vec<f64> = spans.windows(2).map(|pair| (pair[1].0 - pair[0].1) as f64 / 1e6).collect();
-    gaps.sort_by(f64::total_cmp);
-    let median = gaps[gaps.len() / 2];
-    println!("gap between the files in ms: median {median:.1}, largest {:.1}", gaps[gaps.len() - 1]);
-    assert!(median <= 200.0, "median gap {median} ms: {gaps:?}");
+    let spans: Vec<_> = recordings.iter().map(|r| span(r).expect("frames in every file")).collect();
+    let sorted = |mut ms: Vec<f64>| {
+        ms.sort_by(f64::total_cmp);
+        (ms[ms.len() / 2], ms)
+    };
+    let (gap, gaps) = sorted(spans.windows(2).map(|pair| (pair[1].0 - pair[0].1) as f64 / 1e6).collect());
+    let (lost, all_lost) = sorted(
+        spans.iter().zip(&killed_ns).map(|((_, last), killed)| (killed - last) as f64 / 1e6).collect(),
+    );
+    println!("in ms: median gap {gap:.1}, largest {:.1}; median loss {lost:.1}", gaps[gaps.len() - 1]);
+    // On a quiet machine 80 and 30. What is limited here is what no slow machine explains: a buffer that is not flushed.
+    assert!(lost <= 500.0, "frames of the last {lost} ms before a kill are lost: {all_lost:?}");
+    assert!(gap <= 1000.0, "median gap {gap} ms: {gaps:?}");
 
     let Some(mut python) = peers::peer("readable.py") else { return };
     // python's reader does some 20,000 messages a second: a sample of the files.
@@ -111,7 +131,10 @@ fn an_unfinished_file_is_read_by_a_foreign_reader_before_it_is_made_whole() {
     let mut stack = Stack::spawn_in("cut", &toml, scratch, &[]);
     stack.wait_ready();
     let load = Load::start(can_port, 5_000);
-    sleep(Duration::from_millis(1300));
+    stack.wait("4000 messages", || {
+        let recording = stack.recordings().pop()?;
+        (info(&recording)["messages"].as_u64()? >= 4000).then_some(())
+    });
     stack.kill("rec", Signal::KILL);
     load.end();
     stack.wait("the recorder is held", || (stack.service("rec")?["state"] == "held").then_some(()));

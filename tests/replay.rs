@@ -89,7 +89,18 @@ END_VAR
 END_PROGRAM
 ";
 
-fn run(name: &str, seconds: f64, mut during: impl FnMut(&Stack, u16)) -> Stack {
+/// Waits until the plc has made so many more scans: every 5 ms one, if it gets the CPU so often.
+fn scans(stack: &Stack, more: u64) {
+    let scan = || -> Option<u64> {
+        let said = stack.cli(&["plc", "status", "--json"]).stdout;
+        serde_json::from_slice::<serde_json::Value>(&said).ok()?["scan"].as_u64()
+    };
+    let first = stack.wait("a scan", scan);
+    stack.wait(&format!("{more} scans after scan {first}"), || scan().filter(|now| *now >= first + more));
+}
+
+/// A stack that ran until `during` was over and so many more scans were made.
+fn run(name: &str, more: u64, mut during: impl FnMut(&Stack, u16)) -> Stack {
     let port = free_port();
     let scratch = Scratch::new(name);
     scratch.write("main.st", PROGRAM);
@@ -97,7 +108,7 @@ fn run(name: &str, seconds: f64, mut during: impl FnMut(&Stack, u16)) -> Stack {
     let mut stack = Stack::spawn_in(name, &text(port), scratch, &[]);
     stack.wait_ready();
     during(&stack, port);
-    sleep(Duration::from_secs_f64(seconds));
+    scans(&stack, more);
     stack.wait_ready();
     assert_eq!(stack.take_down(), 0, "{}", stack.log());
     stack
@@ -113,7 +124,7 @@ fn verify(recording: &Path, args: &[&str]) -> (i32, serde_json::Value, String) {
 
 #[test]
 fn a_loss_free_recording_verifies_exactly() {
-    let stack = run("verify", 3.0, |_, port| {
+    let stack = run("verify", 600, |_, port| {
         // Writes by Modbus and forces are inputs like any other.
         let mut client = Client::connect(port).unwrap();
         for value in 0..50 {
@@ -130,7 +141,7 @@ fn a_loss_free_recording_verifies_exactly() {
 
 #[test]
 fn forces_starts_and_stops_verify_too() {
-    let stack = run("forces", 0.5, |stack, _| {
+    let stack = run("forces", 100, |stack, _| {
         stack.ok(&["plc", "force", "Speed=1999", "Barrier=TRUE"]);
         sleep(Duration::from_millis(200));
         // Variables of the program are written in one scan, or none of them.
@@ -140,7 +151,10 @@ fn forces_starts_and_stops_verify_too() {
             assert!(said.contains("\"one_scan\":true"), "{said}");
         }
         assert!(!stack.cli(&["plc", "write", "Low=4", "High=nine"]).status.success());
-        assert_eq!(stack.ok(&["plc", "read", "Low", "High", "Torn"]), "Low = 3\nHigh = 3\nTorn = 0\n");
+        assert_eq!(
+            stack.ok(&["plc", "read", "Low", "High", "Torn"]),
+            "main.Low = 3\nmain.High = 3\nmain.Torn = 0\n"
+        );
         stack.ok(&["plc", "stop"]);
         sleep(Duration::from_millis(100));
         stack.ok(&["plc", "run"]);
@@ -157,9 +171,9 @@ fn forces_starts_and_stops_verify_too() {
 fn a_program_loaded_from_elsewhere_verifies_from_the_file_alone() {
     let elsewhere = Scratch::new("elsewhere");
     let other = elsewhere.write("other.st", PROGRAM.replace("1700", "900"));
-    let stack = run("elsewhere", 0.5, |stack, _| {
+    let stack = run("elsewhere", 100, |stack, _| {
         stack.ok(&["plc", "load", other.to_str().unwrap()]);
-        sleep(Duration::from_millis(300));
+        scans(stack, 60);
     });
     // Neither the source nor what the plc left in shared memory is there any more.
     std::fs::remove_file(&other).unwrap();
@@ -178,7 +192,7 @@ fn a_program_loaded_from_elsewhere_verifies_from_the_file_alone() {
 
 #[test]
 fn a_changed_constant_is_named_by_scan_and_variable() {
-    let stack = run("constant", 6.0, |_, _| {});
+    let stack = run("constant", 1100, |_, _| {});
     let other = stack.scratch.write("other.st", PROGRAM.replace("1700", "1500"));
     let (code, report, said) = verify(&stack.recordings()[0], &["--program", other.to_str().unwrap()]);
     assert_eq!(code, 1, "{said}");
@@ -189,13 +203,14 @@ fn a_changed_constant_is_named_by_scan_and_variable() {
 
 #[test]
 fn after_kills_the_spans_are_listed_and_99_of_100_scans_verified() {
-    let stack = run("kills", 4.0, |stack, _| {
-        sleep(Duration::from_secs(3));
+    let stack = run("kills", 1100, |stack, _| {
+        // Long enough between the kills that on a slow machine, too, only one in a hundred waits for a keyframe.
+        scans(stack, 1100);
         for victim in ["rec", "plc", "rec"] {
             let generation = stack.generation(victim);
             stack.kill(victim, Signal::KILL);
             stack.wait_generation_above(victim, generation);
-            sleep(Duration::from_secs(3));
+            scans(stack, 1100);
         }
     });
     let (mut verified, mut total) = (0, 0);
@@ -205,13 +220,14 @@ fn after_kills_the_spans_are_listed_and_99_of_100_scans_verified() {
         let (code, report, said) = verify(recording, &[]);
         assert!(code == 0 || code == 3, "{}: exit {code}\n{said}", recording.display());
         if code == 3 {
-            assert!(!report["unverifiable"].as_array().unwrap().is_empty(), "{said}");
+            let listed = |key: &str| report[key].as_array().unwrap().len();
+            assert!(listed("unverifiable") + listed("incomplete") > 0, "{said}");
         }
         verified += report["scans_verified"].as_u64().unwrap();
         total += report["scans"].as_u64().unwrap();
     }
     assert!(verified as f64 >= 0.99 * total as f64, "{verified} of {total} scans verified");
-    assert!(total > 2000, "{total}");
+    assert!(total > 3500, "{total}");
 }
 
 #[test]
@@ -223,8 +239,9 @@ fn every_file_of_a_rotated_recording_verifies_alone() {
     let toml = text(port).replace("dir = \"recordings\"\n", "dir = \"recordings\"\nmax_time = \"10s\"\n");
     let mut stack = Stack::spawn_in("rotate", &toml, scratch, &[]);
     stack.wait_ready();
+    scans(&stack, 1100);
     stack.wait("a second file", || (stack.recordings().len() >= 2).then_some(()));
-    sleep(Duration::from_secs(2));
+    scans(&stack, 300);
     assert_eq!(stack.take_down(), 0, "{}", stack.log());
     let mut scans = 0;
     for recording in stack.recordings() {

@@ -7,7 +7,7 @@ mod support;
 use rustix::fs::OFlags;
 use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
-use rustix::termios::{LocalModes, Termios, Winsize, tcgetattr, tcsetwinsize};
+use rustix::termios::{Action, LocalModes, Termios, Winsize, tcflow, tcgetattr, tcsetwinsize};
 use serde_json::Value;
 use std::io::{Read, Write};
 use std::process::{Child, ExitStatus, Stdio};
@@ -18,7 +18,11 @@ const PROGRAM: &str =
     "PROGRAM main\nVAR n : UDINT; out AT %QW0 : UINT; END_VAR\nn := n + 1;\nout := 4660;\nEND_PROGRAM\n";
 
 fn stack(name: &str) -> Stack {
-    let text = format!(
+    Stack::up(name, &stack_text(), &[("main.st", PROGRAM)])
+}
+
+fn stack_text() -> String {
+    format!(
         r#"
 [stack]
 name = "NAME"
@@ -57,8 +61,7 @@ kind = "modbus-server"
 tcp = {{ address = "127.0.0.1", port = {} }}
 "#,
         free_port()
-    );
-    Stack::up(name, &text, &[("main.st", PROGRAM)])
+    )
 }
 
 /// `dinrail top` on a pty of its own.
@@ -74,7 +77,7 @@ struct Screen {
 
 impl Screen {
     fn open(stack: &str, columns: u16, rows: u16) -> Self {
-        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
+        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
         grantpt(&master).unwrap();
         unlockpt(&master).unwrap();
         let path = ptsname(&master, Vec::new()).unwrap();
@@ -127,16 +130,20 @@ impl Screen {
         self.master.write_all(keys.as_bytes()).unwrap();
     }
 
-    fn end(mut self) -> ExitStatus {
+    fn wait_for_exit(&mut self) -> ExitStatus {
         let begin = Instant::now();
-        let status = loop {
+        loop {
             self.read();
             if let Some(status) = self.child.try_wait().unwrap() {
-                break status;
+                return status;
             }
             assert!(begin.elapsed() < PATIENCE, "top does not end");
             std::thread::sleep(Duration::from_millis(10));
-        };
+        }
+    }
+
+    fn end(mut self) -> ExitStatus {
+        let status = self.wait_for_exit();
         self.read();
         let text = String::from_utf8_lossy(&self.written);
         assert!(text.contains("\x1b[?1049l"), "the alternate screen was not left: {text:?}");
@@ -227,6 +234,31 @@ fn top_shows_the_stack_takes_keys_and_leaves_the_terminal_as_it_was() {
 }
 
 #[test]
+fn top_ends_with_its_terminal_and_by_every_signal() {
+    let mut stack = stack("topgone");
+    // The window is closed: no signal comes, reads and writes fail.
+    let mut screen = Screen::open(&stack.name, 80, 24);
+    screen.wait_for("SERVICE");
+    screen.master = std::fs::File::open("/dev/null").unwrap();
+    screen.wait_for_exit();
+
+    let mut screen = Screen::open(&stack.name, 80, 24);
+    screen.wait_for("SERVICE");
+    kill_process(Pid::from_child(&screen.child), Signal::HUP).unwrap();
+    assert_eq!(screen.end().code(), Some(0));
+
+    // A terminal that takes no output (Ctrl-S): the loop stands in a write.
+    let mut screen = Screen::open(&stack.name, 80, 24);
+    screen.wait_for("SERVICE");
+    tcflow(&screen.slave, Action::OOff).unwrap();
+    std::thread::sleep(Duration::from_millis(600));
+    kill_process(Pid::from_child(&screen.child), Signal::TERM).unwrap();
+    screen.wait_for_exit();
+    tcflow(&screen.slave, Action::OOn).unwrap();
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
 fn without_a_terminal_the_way_for_programs_is_named() {
     let output = dinrail().arg("top").output().unwrap();
     let errors = String::from_utf8_lossy(&output.stderr);
@@ -260,6 +292,62 @@ fn status_shows_every_service_or_those_asked_for() {
     let errors = String::from_utf8_lossy(&refused.stderr);
     assert_eq!(refused.status.code(), Some(1));
     assert!(errors.contains("no service 'plv'; did you mean 'plc'?"), "{errors}");
+    assert_eq!(stack.take_down(), 0);
+}
+
+const NAMED: &str = "TYPE Mode : (Off, Auto := 5); END_TYPE
+PROGRAM main
+VAR n : UDINT; mode : Mode := Auto; pause : TIME := T#500ms; hold : TON; END_VAR
+n := n + 1; hold(IN := TRUE, PT := pause);
+END_PROGRAM
+";
+
+#[test]
+fn variables_of_a_plc_are_named_as_people_name_them() {
+    let mut stack = Stack::up("plcnames", &stack_text(), &[("main.st", NAMED)]);
+    let list = stack.ok(&["plc", "list"]);
+    for expected in ["main.mode", "Mode (Off, Auto)", "Command", "%QW0", "main.hold.ET"] {
+        assert!(list.contains(expected), "{expected} is missing:\n{list}");
+    }
+    assert_eq!(stack.ok(&["plc", "read", "mode", "pause"]), "main.mode = Auto (5)\nmain.pause = T#500ms\n");
+    assert!(stack.ok(&["plc", "read", "hold"]).contains("main.hold.PT = T#500ms\n"));
+    assert_eq!(
+        stack.ok(&["plc", "write", "mode=off", "pause=T#1m30s"]),
+        "main.mode = Off (0)\nmain.pause = T#1m30s\n"
+    );
+    assert_eq!(stack.read("main.pause"), 90_000);
+    let refused = |args: &[&str]| {
+        let output = stack.cli(args);
+        assert_eq!(output.status.code(), Some(1));
+        String::from_utf8_lossy(&output.stderr).into_owned()
+    };
+    assert!(refused(&["plc", "read", "main.modee"]).contains("did you mean 'main.mode'?"));
+    assert!(refused(&["plc", "force", "mode=Aut"]).contains("did you mean 'Auto'?"));
+    let watched = stack.ok(&["plc", "watch", "n", "mode", "--every", "100ms", "--for", "1s", "--json"]);
+    let looks: Vec<Value> = watched.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(
+        (&looks[0]["values"]["main.mode"], &looks[0]["names"]["main.mode"]),
+        (&0.into(), &"Off".into())
+    );
+    assert!(looks.len() > 1 && looks[1]["values"]["main.n"].is_u64(), "{watched}");
+    assert!(looks[1]["values"]["main.mode"].is_null(), "it has not changed: {watched}");
+    let status = stack.ok(&["plc", "status"]);
+    assert!(
+        status.contains("state    ") && status.contains("program  ") && !status.contains('{'),
+        "{status}"
+    );
+    assert_eq!(stack.take_down(), 0);
+}
+
+#[test]
+fn symbols_of_the_stack_work_without_a_program() {
+    let text = stack_text().replace("program = [\"main.st\"]", "");
+    let mut stack = Stack::up("plcnone", &text, &[]);
+    assert_eq!(stack.ok(&["plc", "write", "Command=7"]), "Command = 7\n");
+    assert_eq!(stack.ok(&["plc", "read", "command", "%QW0"]), "Command = 7\n%QW0 = 7\n");
+    stack.ok(&["plc", "force", "Command=8"]);
+    assert_eq!(stack.read("%QW0"), 8);
+    stack.ok(&["plc", "unforce", "Command"]);
     assert_eq!(stack.take_down(), 0);
 }
 

@@ -4,7 +4,7 @@ use crate::inbox::Bell;
 use crate::payload::{Payload, Stamp, as_bytes};
 use crate::rail::{RailError, Svc, service_name};
 use crate::stack::TopicEntry;
-use crate::topic::{TopicKind, WhenFull};
+use crate::topic::{MAX_NODES, TopicKind, WhenFull};
 use crate::{clock, with_payload};
 use iceoryx2::node::Node;
 use iceoryx2::port::publisher::Publisher as IoxPublisher;
@@ -41,7 +41,7 @@ fn open<H: Payload>(node: &Node<Svc>, topic: &TopicEntry) -> Result<Factory<H>, 
         .publish_subscribe::<[u8]>()
         .user_header::<H>()
         .open()
-        .map_err(|e| RailError::middleware(format!("opening topic '{}'", topic.name), e))
+        .map_err(|e| RailError::port(format!("opening topic '{}'", topic.name), MAX_NODES, e))
 }
 
 /// A writer of a topic.
@@ -78,7 +78,7 @@ impl<H: Payload> Publisher<H> {
         let port = builder
             .set_backpressure_handler(|_| BackpressureAction::DiscardDataAndFail)
             .create()
-            .map_err(|e| RailError::middleware(format!("publisher on '{}'", topic.name), e))?;
+            .map_err(|e| RailError::port(format!("publisher on '{}'", topic.name), topic.max_publishers, e))?;
         Ok(Self {
             port,
             factory,
@@ -268,7 +268,7 @@ impl<H: Payload> Subscriber<H> {
             .subscriber_builder()
             .buffer_size(topic.depth as usize)
             .create()
-            .map_err(|e| RailError::middleware(format!("subscriber on '{}'", topic.name), e))?;
+            .map_err(|e| RailError::port(format!("subscriber on '{}'", topic.name), topic.max_subscribers, e))?;
         // Connects at once: history is handed over and a refusing writer sees its reader.
         let _ = port.has_samples();
         Ok(Self {

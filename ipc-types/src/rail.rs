@@ -34,6 +34,12 @@ pub enum RailError {
     Stack { path: PathBuf, message: String },
     #[error("rail: {what} failed: {cause}; is /dev/shm full, or the limit of open files reached?")]
     Middleware { what: String, cause: String },
+    /// `cause` is the middleware's own word for it.
+    #[error(
+        "rail: {what}: too many tools use it at this moment, at most {limit} ports fit ({cause}); end a `dinrail top`, \
+         `dinrail can dump` or the like"
+    )]
+    Crowded { what: String, limit: u32, cause: String },
     #[error("rail: topic '{0}' is not part of this stack; the service's topics() must declare it")]
     UnknownTopic(String),
     #[error("rail: topic '{topic}' carries {has}, not {asked}")]
@@ -47,6 +53,16 @@ pub enum RailError {
 impl RailError {
     pub(crate) fn middleware(what: impl Into<String>, cause: impl std::fmt::Debug) -> Self {
         Self::Middleware { what: what.into(), cause: format!("{cause:?}") }
+    }
+
+    /// Of a port: a topic has places for so many, and for [`MAX_NODES`] processes.
+    pub(crate) fn port(what: String, ports: u32, cause: impl std::fmt::Debug) -> Self {
+        let cause = format!("{cause:?}");
+        if cause.contains("ExceedsMax") {
+            let limit = if cause.contains("Nodes") { MAX_NODES } else { ports };
+            return Self::Crowded { what, limit, cause };
+        }
+        Self::Middleware { what, cause }
     }
 }
 

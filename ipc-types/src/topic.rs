@@ -216,7 +216,7 @@ mod tests {
         assert_eq!(
             TopicKind::CanRx.ros1msg(),
             "uint64 seq\nuint64 t_ns\nuint32 generation\nuint32 writer\nuint32 can_id\nuint8 len\nuint8 fd_flags\n\
-             uint8 flags\nuint8 reserved\nuint8[64] data\n"
+             uint8 flags\nuint8 sender\nuint8[64] data\n"
         );
         assert!(TopicKind::Scan.ros1msg().ends_with("uint32 total\nuint8[] data\n"));
         assert_eq!(TopicKind::CanRx.header_bytes(), 96);

@@ -86,4 +86,16 @@ fn the_rail_carries_numbers_refuses_and_wakes() {
     });
     assert_eq!(bodies[0]["message"], "works");
     assert!(ctx.subscriber::<Inputs>("can0/rx").is_err(), "another payload is refused");
+
+    // More readers than there are places for: the way out is named, and it is not the shared memory.
+    let mut crowd = Vec::new();
+    let refused = loop {
+        match ctx.subscriber::<Inputs>("io/inputs") {
+            Ok(one) if crowd.len() < 100 => crowd.push(one),
+            other => break other.map(|_| ()).unwrap_err().to_string(),
+        }
+    };
+    let limit = ipc_types::rail::port_limits(TopicKind::Inputs, 3, 3).1;
+    assert!(refused.contains(&format!("at most {limit} ports fit")), "{refused}");
+    assert!(refused.contains("end a `dinrail top`") && !refused.contains("/dev/shm"), "{refused}");
 }

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 
 /// Programmable bus gateway and soft PLC.
 #[derive(Debug, Parser)]
-#[command(name = "dinrail", version, propagate_version = true, disable_help_subcommand = true)]
+#[command(name = "dinrail", version, propagate_version = true)]
 pub struct Cli {
     /// Results as JSON
     #[arg(long, global = true)]
@@ -102,33 +102,18 @@ pub enum Command {
         /// The plc service; not needed when the stack has only one
         #[arg(long, global = true, value_name = "NAME")]
         service: Option<String>,
+        /// Name of the running stack; not needed when only one runs
         #[arg(long, global = true, value_name = "NAME")]
         stack: Option<String>,
         #[command(subcommand)]
         command: PlcCommand,
     },
     /// Run a program in virtual time and print or compare its variables
-    Trace {
-        /// Source files
-        #[arg(required = true)]
-        files: Vec<PathBuf>,
-        /// Inputs and expected values; exit 1 at the first difference
-        #[arg(long, conflicts_with_all = ["cycle", "scans", "set"])]
-        case: Option<PathBuf>,
-        /// Time between scans
-        #[arg(long, value_name = "DURATION", required_unless_present = "case")]
-        cycle: Option<Span>,
-        /// Number of scans
-        #[arg(long, required_unless_present = "case")]
-        scans: Option<u64>,
-        /// Set a variable before a scan; the first scan is 1
-        #[arg(long, value_name = "SCAN:VAR=VALUE")]
-        set: Vec<String>,
-    },
+    Trace(crate::commands::trace::TraceArgs),
     /// Compile a program to WebAssembly
     Build {
-        #[arg(required = true)]
-        files: Vec<PathBuf>,
+        #[command(flatten)]
+        program: crate::commands::sources::ProgramArgs,
         /// Where to write it
         #[arg(short, long, value_name = "FILE")]
         output: PathBuf,
@@ -179,6 +164,13 @@ pub enum Command {
     },
     /// JSON schema of stack files, for editors
     Schema,
+    /// Script that completes commands and options in a shell
+    #[command(after_help = "bash:  dinrail completion bash > ~/.local/share/bash-completion/completions/dinrail\n\
+        zsh:   dinrail completion zsh > DIR/_dinrail, DIR being in $fpath\n\
+        fish:  dinrail completion fish > ~/.config/fish/completions/dinrail.fish")]
+    Completion { shell: crate::commands::completion::Shell },
+    /// Write manual pages of all commands into a folder
+    Man { folder: PathBuf },
     /// Measure this machine, each figure beside its goal
     Bench(crate::commands::bench::BenchArgs),
     #[command(name = "__service", hide = true)]
@@ -227,10 +219,27 @@ pub enum PlcCommand {
         #[arg(long)]
         all: bool,
     },
-    /// Values of variables or %-addresses
+    /// Values of variables or %-addresses; of an instance those of its members
     Read {
         #[arg(required = true, value_name = "VAR")]
         variables: Vec<String>,
+    },
+    /// Every variable with type, address and where it is declared
+    List {
+        /// Only lines with this text
+        filter: Option<String>,
+    },
+    /// Values as they change: on a terminal in place, else a line for every change
+    Watch {
+        /// Variables, instances, %-addresses; all variables when left out
+        #[arg(value_name = "VAR")]
+        variables: Vec<String>,
+        /// Time between two looks
+        #[arg(long, default_value = "500ms", value_name = "DURATION")]
+        every: Span,
+        /// End after so long; without it at Ctrl-C
+        #[arg(long = "for", value_name = "DURATION")]
+        duration: Option<Span>,
     },
     /// Set variables or %-addresses once, all in one scan; none when one of them is wrong
     Write {

@@ -7,6 +7,12 @@
 //! Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done but with data loss. Results go to stdout, diagnostics to
 //! stderr.
 
+/// As that of the standard library, but text from files and the wire cannot steer the terminal, and a stderr that is gone
+/// is no panic.
+macro_rules! eprintln {
+    ($($text:tt)*) => { $crate::terminal::say(&format!($($text)*)) };
+}
+
 mod cli;
 mod commands;
 mod explain_keys;
@@ -14,6 +20,7 @@ mod kinds;
 pub mod stackfile;
 mod stacks;
 mod supervise;
+mod terminal;
 
 use clap::Parser;
 use std::process::ExitCode;

@@ -12,11 +12,11 @@ from pymodbus.pdu.file_message import FileRecord
 kind, target = sys.argv[1:3]
 if kind in ("tcp", "rtu_over_tcp"):
     framer = FramerType.SOCKET if kind == "tcp" else FramerType.RTU
-    client = ModbusTcpClient("127.0.0.1", port=int(target), framer=framer, timeout=5, retries=0)
+    client = ModbusTcpClient("127.0.0.1", port=int(target), framer=framer, timeout=20, retries=0)
 else:
     framer = FramerType.RTU if kind == "rtu" else FramerType.ASCII
     # A pseudo-terminal has no parity.
-    client = ModbusSerialClient(target, framer=framer, baudrate=19200, parity="N", timeout=5, retries=0)
+    client = ModbusSerialClient(target, framer=framer, baudrate=19200, parity="N", timeout=20, retries=0)
 assert client.connect(), "no connection"
 unit = {"device_id": 1}
 

@@ -7,7 +7,7 @@ import sys
 from pymodbus.client import ModbusTcpClient
 
 port, table, address, count = int(sys.argv[1]), sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
-client = ModbusTcpClient("127.0.0.1", port=port, timeout=5)
+client = ModbusTcpClient("127.0.0.1", port=port, timeout=20)
 assert client.connect(), "no connection"
 read = {"holding": client.read_holding_registers, "input": client.read_input_registers,
         "coils": client.read_coils, "discrete": client.read_discrete_inputs}[table]

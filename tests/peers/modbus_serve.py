@@ -38,10 +38,10 @@ async def main():
         ModbusServerRequestHandler.handle_request = ours_only
         framer = FramerType.ASCII if kind == "ascii" else FramerType.RTU
         server = ModbusSerialServer(context, framer=framer, port=where, baudrate=19200, ignore_missing_devices=True)
-    task = asyncio.create_task(server.serve_forever())
-    await asyncio.sleep(0.3)
+    # Comes back when it listens, or when the port is open.
+    await server.serve_forever(background=True)
     print("ready", flush=True)
-    await task
+    await server.serving
 
 
 logging.basicConfig(level=logging.ERROR)

@@ -6,7 +6,7 @@ import sys
 
 from pyModbusTCP.client import ModbusClient
 
-client = ModbusClient(host="127.0.0.1", port=int(sys.argv[1]), unit_id=1, timeout=5)
+client = ModbusClient(host="127.0.0.1", port=int(sys.argv[1]), unit_id=1, timeout=20)
 assert client.write_multiple_registers(70, [1, 2, 3])
 assert client.read_holding_registers(70, 3) == [1, 2, 3]
 assert client.write_single_register(71, 9)

@@ -11,14 +11,14 @@ from umodbus.client.serial import rtu
 from umodbus.exceptions import IllegalDataAddressError
 
 port, device = int(sys.argv[1]), sys.argv[2]
-connection = socket.create_connection(("127.0.0.1", port), timeout=10)
+connection = socket.create_connection(("127.0.0.1", port), timeout=20)
 
 
 def over_tcp(message):
     return tcp.send_message(message, connection)
 
 
-line = serial.Serial(device, 19200, timeout=5)
+line = serial.Serial(device, 19200, timeout=20)
 
 
 def over_rtu(message):

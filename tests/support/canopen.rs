@@ -1,6 +1,7 @@
 //! CANopen networks of simulated nodes, and what their users are shown.
 
-use super::Stack;
+use super::peers::{Peer, peer};
+use super::{Scratch, Stack};
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -67,6 +68,47 @@ PROGRAM Device
   Level := Valve + 1;
 END_PROGRAM
 ";
+
+/// Simulated devices without node-id, with the serial numbers 1 to 8.
+pub fn eight_without_node_id() -> String {
+    (1..=8u8).map(|n| slave(&format!("device{n}"), 255, &format!("serial_number = {n}"))).collect()
+}
+
+/// `dinrail canopen lss fastscan` gives eight devices node-ids from `from` on, in order of their serial numbers, which
+/// count from `serial` on. Returns what it said.
+pub fn fastscan_finds_eight(stack: &Stack, from: u8, serial: u32, more: &[&str]) -> String {
+    let first = from.to_string();
+    let found = stack.ok(&[&["canopen", "lss", "fastscan", "--from", &first], more].concat());
+    for n in 0..8u8 {
+        let line = format!("serial 0x{:08X}  -> node-id {}", serial + u32::from(n), from + n);
+        assert!(found.contains(&line), "{line} is not in\n{found}");
+    }
+    found
+}
+
+/// A device made of python-canopen; its serial number is its node-id. `place`: a port of a cannelloni server, or a network
+/// interface. It says `ready`.
+pub fn python_slave(place: &str, eds: &Path, node: u8) -> Peer {
+    let mut command = peer("canopen_slave.py").unwrap();
+    command.arg(place).arg(eds).args([node.to_string(), node.to_string()]);
+    Peer::start(command)
+}
+
+/// Devices made of durand, with these serial numbers; `place` as for [`python_slave`]. They say `ready`.
+pub fn durand(place: &str, node: u8, serials: impl IntoIterator<Item = u32>) -> Peer {
+    let mut command = peer("durand_slave.py").unwrap();
+    command.args([place, &node.to_string()]).args(serials.into_iter().map(|serial| serial.to_string()));
+    Peer::start(command)
+}
+
+/// A scratch folder with the EDS that durand makes of its device, `durand.eds`.
+pub fn with_durand_eds(what: &str) -> Option<Scratch> {
+    let output = peer("durand_slave.py")?.arg("eds").output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let scratch = Scratch::new(what);
+    scratch.write("durand.eds", output.stdout);
+    Some(scratch)
+}
 
 /// `dinrail canopen status --json`.
 pub fn status(stack: &Stack) -> Option<Value> {
@@ -157,12 +199,21 @@ pub fn long_value(bytes: usize) -> Vec<u8> {
 /// Writes and reads a long value by the command line.
 pub fn there_and_back(stack: &Stack, node: &str, bytes: usize, mode: &str) {
     let value = long_value(bytes);
-    let file = stack.scratch.write("value.bin", &value);
-    let back = stack.scratch.0.join("back.bin");
+    there(stack, node, &value, mode);
+    back(stack, node, &value, mode);
+}
+
+pub fn there(stack: &Stack, node: &str, value: &[u8], mode: &str) {
+    let file = stack.scratch.write("value.bin", value);
     stack.ok(&["canopen", "sdo", "write", node, "2000", "--input", path(&file), "--mode", mode]);
-    stack.ok(&["canopen", "sdo", "read", node, "2000", "--output", path(&back), "--mode", mode]);
-    assert_eq!(fs::read(&back).unwrap().len(), bytes);
-    assert!(fs::read(&back).unwrap() == value, "{bytes} bytes to node {node}, {mode}");
+}
+
+pub fn back(stack: &Stack, node: &str, value: &[u8], mode: &str) {
+    let file = stack.scratch.0.join("back.bin");
+    stack.ok(&["canopen", "sdo", "read", node, "2000", "--output", path(&file), "--mode", mode]);
+    let read = fs::read(&file).unwrap();
+    assert_eq!(read.len(), value.len());
+    assert!(read == value, "{} bytes of node {node}, {mode}", value.len());
 }
 
 pub fn path(path: &Path) -> &str {

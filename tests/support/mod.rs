@@ -4,6 +4,7 @@
 pub mod c_peer;
 pub mod canopen;
 pub mod car;
+pub mod commands;
 pub mod modbus;
 pub mod pcap;
 pub mod peers;
@@ -38,9 +39,21 @@ pub fn wait_for<T>(what: &str, limit: Duration, mut check: impl FnMut() -> Optio
     }
 }
 
-/// A TCP port that nobody uses now.
+/// A TCP port that nobody uses now, and that neither another call nor the kernel gives to anybody else: each port of this
+/// process once, below those that the kernel takes for outgoing connections.
 pub fn free_port() -> u16 {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+    const FIRST: u32 = 10_000;
+    static GIVEN: AtomicU32 = AtomicU32::new(0);
+    let range = fs::read_to_string("/proc/sys/net/ipv4/ip_local_port_range").unwrap_or_default();
+    let kernels = range.split_whitespace().next().and_then(|n| n.parse().ok()).unwrap_or(32_768);
+    let places = if kernels > FIRST + 1000 { kernels - FIRST } else { 50_000 };
+    // Test programs that run at the same time begin at other places.
+    let begin = std::process::id().wrapping_mul(7919);
+    wait_for("a free port", PATIENCE, || {
+        let place = begin.wrapping_add(GIVEN.fetch_add(1, Ordering::Relaxed)) % places;
+        let port = u16::try_from(FIRST + place).unwrap();
+        TcpListener::bind(("127.0.0.1", port)).is_ok().then_some(port)
+    })
 }
 
 /// The public cases that are no part of the project, or `None` after saying loudly that the test is skipped.

@@ -6,6 +6,7 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
 use std::time::Duration;
 
 /// Transfers of a megabyte by interpreted programs, on a machine that is shared.
@@ -33,6 +34,8 @@ pub fn program(name: &str, package: &str) -> Option<Command> {
 pub struct Peer {
     child: Child,
     said: Arc<Mutex<Vec<String>>>,
+    /// Threads that read what it says.
+    readers: Vec<JoinHandle<()>>,
     /// Lines already waited for.
     taken: usize,
 }
@@ -44,15 +47,16 @@ impl Peer {
         let said = Arc::new(Mutex::new(Vec::new()));
         let pipes: [Box<dyn Read + Send>; 2] =
             [Box::new(child.stdout.take().unwrap()), Box::new(child.stderr.take().unwrap())];
-        for pipe in pipes {
+        let read = |pipe: Box<dyn Read + Send>| {
             let said = Arc::clone(&said);
             std::thread::spawn(move || {
                 for line in BufReader::new(pipe).lines().map_while(Result::ok) {
                     said.lock().unwrap().push(line);
                 }
-            });
-        }
-        Self { child, said, taken: 0 }
+            })
+        };
+        let readers = pipes.into_iter().map(read).collect();
+        Self { child, said, readers, taken: 0 }
     }
 
     pub fn all(&self) -> Vec<String> {
@@ -63,12 +67,13 @@ impl Peer {
     pub fn says(&mut self, line: &str) {
         let start = std::time::Instant::now();
         loop {
+            // Asked before what it said: the last line may be read after its end.
+            let ended = self.readers.iter().all(JoinHandle::is_finished);
             let said = self.all();
             if let Some(at) = said[self.taken..].iter().position(|l| l == line) {
                 self.taken += at + 1;
                 return;
             }
-            let ended = self.child.try_wait().unwrap().is_some();
             assert!(
                 !ended && start.elapsed() < LONG,
                 "waited in vain for '{line}'; the peer {}said:\n{}",

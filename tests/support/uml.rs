@@ -83,9 +83,11 @@ fn boot_with(script: &str, work: &Work, variables: &[(&str, &str)]) -> Option<()
     let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/uml").canonicalize().unwrap();
     let log = fs::File::create(work.0.join("kernel.log")).unwrap();
     // The kernel's memory is a file that is mapped executable.
-    let memory = ["/dev/shm", "/tmp", "/var/tmp"].into_iter().find(|dir| executable(Path::new(dir)));
-    let Some(memory) = memory else {
-        skip("no folder for temporary files allows to execute: user-mode Linux cannot boot");
+    let folders = ["/dev/shm", "/tmp", "/var/tmp"].map(Path::new);
+    let Some(memory) = folders.into_iter().find(|dir| has_room(dir) && executable(dir)) else {
+        skip(
+            "no folder for temporary files has 1.5 GiB free and allows to execute: user-mode Linux cannot boot",
+        );
         return None;
     };
     let preload = work.0.join("xstate.so");
@@ -126,6 +128,12 @@ fn boot_with(script: &str, work: &Work, variables: &[(&str, &str)]) -> Option<()
     assert!(work.0.join("done").exists(), "the guest ended early or hung:\n{}", work.logs());
     assert_eq!(work.text("in_vain"), "", "{}", work.logs());
     Some(())
+}
+
+/// Whether the memory of a guest fits there: in many a container /dev/shm has 64 MiB, and a guest that finds it full
+/// dies.
+fn has_room(dir: &Path) -> bool {
+    rustix::fs::statvfs(dir).is_ok_and(|found| found.f_bavail.saturating_mul(found.f_frsize) >= 3 << 29)
 }
 
 /// Whether a program there could be run: user-mode Linux maps its memory executable.

@@ -42,9 +42,12 @@ STACK
 "$DINRAIL" up again.toml >"$WORK/again.log" 2>&1 &
 up=$!
 until_ok "the second stack works" ready
+listeners() { grep -c ' raw' /proc/net/can/rcvlist_all; }
+more_than() { [ "$(listeners)" -gt "$1" ]; }
+before=$(listeners)
 candump -r 33554432 -L vcan0 >again.candump &
 candump=$!
-sleep 1
+until_ok "candump listens" more_than "$before"
 "$DINRAIL" can replay recordings/*.mcap --bus can0 >"$WORK/again.replay" 2>&1
 echo "exit $?" >>"$WORK/again.replay"
 until_ok "candump saw it all" lines again.candump "$COUNT"

@@ -69,6 +69,12 @@ until_ok() {
 health() { "$DINRAIL" ps --json | python3 -c 'import json,sys; print(next(r["health"] for r in json.load(sys.stdin) if r["service"] == sys.argv[1]))' "$1"; }
 is() { [ "$(health "$1")" = "$2" ]; }
 lines() { [ "$(wc -l <"$1")" -ge "$2" ]; }
+# A dump listens when it shows a mark, which a bus of the stack sends until then. The test passes over marks.
+marked() { "$DINRAIL" can send "$2" "$3" && sleep 0.1 && grep -q "$3" "$1"; }
+listens() { until_ok "$1 listens" marked "$1" "$2" "${3:-7F0#AA}"; }
+# candump listens when the kernel has one listener to everything more than before.
+listeners() { grep -c ' raw' /proc/net/can/rcvlist_all; }
+more_than() { [ "$(listeners)" -gt "$1" ]; }
 
 "$DINRAIL" up stack.toml >"$WORK/up.log" 2>&1 &
 until_ok "the driver works" is can0 ready
@@ -77,11 +83,13 @@ until_ok "a missing interface does not stop the stack" is gone degraded
 until_ok "the serial adapter works" is adapter ready
 
 say "own transmissions"
-candump -L vcan0 >"$WORK/own.candump" &
-own=$!
 "$DINRAIL" can dump can0 --json >"$WORK/own.dump" 2>&1 &
 dump=$!
-sleep 1
+listens "$WORK/own.dump" can0
+before=$(listeners)
+candump -L vcan0 >"$WORK/own.candump" &
+own=$!
+until_ok "candump listens" more_than "$before"
 frames=()
 for i in $(seq 0 199); do frames+=("$(printf '%03X#%08X' $((i * 7 % 2048)) "$i")"); done
 frames+=(1ABCDEF0#0102030405060708 123#R4 7FF# "321##1$(printf 'A5%.0s' $(seq 64))" '1ABCDEF0##0')
@@ -106,7 +114,9 @@ say "filters in the kernel"
 dump=$!
 "$DINRAIL" can dump can0 >"$WORK/all.dump" 2>&1 &
 all=$!
-sleep 1
+listens "$WORK/all.dump" can0
+# These are frames of another sender to can0: the test counts them.
+listens "$WORK/some.dump" some 7F1#AA
 for frame in 5A1#01 123#02 1F0000AA#03 000005A1#04 5AF#R2 5B0#05 1F0001AA#06 20000080#0000000000000000; do
     cansend vcan0 "$frame"
 done
@@ -122,12 +132,14 @@ import sys
 for i in range(int(sys.argv[1])):
     print(f"({1700000000 + i / 2000:.6f}) c {i % 2048:03X}#{i:08X}")
 PY
+"$DINRAIL" can dump can0 >in.dump 2>"$WORK/in.dump.err" &
+dump=$!
+listens in.dump can0
+before=$(listeners)
 # A receive buffer that lets it sleep for seconds on this one processor.
 candump -r 33554432 -L vcan0 >out.candump 2>"$WORK/out.candump.err" &
 out=$!
-"$DINRAIL" can dump can0 >in.dump 2>"$WORK/in.dump.err" &
-dump=$!
-sleep 1
+until_ok "candump listens" more_than "$before"
 canplayer -I in.log vcan0=c &
 player=$!
 python3 - "$COUNT" <<'PY'
@@ -148,17 +160,22 @@ for i in range(int(sys.argv[1])):
     s.sendall(b"< send %08X 4 %x %x %x %x >" % (0x10000 + i % 2048, *i.to_bytes(4, "big")))
     if i % 20 == 19:
         time.sleep(max(0, start + (i + 1) / 2000 - time.monotonic()))
-time.sleep(1)
+# When this is answered all before it was read.
+s.sendall(b"< echo >")
+text = b""
+while b"< echo >" not in text:
+    text += s.recv(64)
 PY
 wait $player
 until_ok "candump saw both directions" lines out.candump $((2 * COUNT))
-until_ok "the stack saw both directions" lines in.dump $((2 * COUNT))
+until_ok "the stack saw both directions" lines in.dump $((2 * COUNT + $(grep -c '7F0#AA' in.dump)))
 kill $out $dump
 cp out.candump in.dump "$WORK"
 
 say "down and up again"
 "$DINRAIL" can dump can0 >"$WORK/updown.dump" 2>&1 &
 dump=$!
+listens "$WORK/updown.dump" can0
 for round in 1 2 3; do
     ip link set vcan0 down
     until_ok "down $round seen" is can0 degraded
@@ -211,9 +228,10 @@ say "slcand on our terminal"
 dump=$!
 slcand -o -s6 "$(readlink /tmp/slcan)" slcan0
 until_ok "slcan0 is there" ip link set slcan0 up
+before=$(listeners)
 candump -L slcan0 >"$WORK/slcan0.candump" &
 candumped=$!
-sleep 1
+until_ok "candump listens to slcan0" more_than "$before"
 until_ok "a frame of slcand" sh -c "cansend slcan0 321#1122; sleep 0.2; grep -q '321#1122' $WORK/virt.dump"
 cansend slcan0 1ABCDEF0#0102030405060708
 cansend slcan0 123#R3
@@ -226,7 +244,7 @@ kill "$(pidof slcand)"
 say "our SLCAN client on our terminal"
 "$DINRAIL" can dump far >"$WORK/far.dump" 2>&1 &
 dump=$!
-sleep 0.5
+listens "$WORK/far.dump" far
 "$DINRAIL" can send adapter 123#01 1ABCDEF0#02 >"$WORK/adapter.send" 2>&1
 until_ok "frames by the adapter" grep -q '1ABCDEF0#02' "$WORK/far.dump"
 kill $dump

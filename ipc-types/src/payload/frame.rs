@@ -48,8 +48,9 @@ payload! {
         pub fd_flags: u8,
         /// [`can_flag`]s.
         pub flags: u8,
-        /// Reserved, 0.
-        pub reserved: u8,
+        /// On `rx`, of an echo: the low 8 bits of the number of the process that sent it; 0 = not told, as in recordings
+        /// made before it was, and in everything that is no echo. See [`CanFrame::echo_of`].
+        pub sender: u8,
         /// Data; bytes behind `len` are 0.
         pub data: [u8; 64],
     }
@@ -63,6 +64,15 @@ impl CanFrame {
         let mut frame = Self { can_id, len: len as u8, ..Self::default() };
         frame.data[..len].copy_from_slice(&data[..len]);
         frame
+    }
+    /// Whether this is the echo of a frame that this writer sent; `None`: an echo that does not tell whose. `Some(false)`
+    /// is certain. `Some(true)` is so among the services of a stack; a tool, whose number is a process id, has the same
+    /// low bits as another sender in one of 256 cases.
+    pub fn echo_of(&self, writer: u32) -> Option<bool> {
+        if self.flags & can_flag::TX_ECHO == 0 {
+            return Some(false);
+        }
+        (self.sender != 0).then_some(self.sender == (writer & 0xFF) as u8)
     }
     /// Identifier without flags.
     pub fn id(&self) -> u32 {
@@ -154,5 +164,26 @@ payload! {
         pub flags: u32,
         /// Bytes of the tail.
         pub n: u32,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_echo_is_ours_somebody_elses_or_does_not_tell() {
+        let frame = |flags, sender| CanFrame { flags, sender, ..CanFrame::classic(0x123, &[]) };
+        for (flags, sender, writer, answer) in [
+            (0, 0, 3, Some(false)),
+            (can_flag::TX_ECHO, 0, 3, None),
+            (can_flag::TX_ECHO, 3, 3, Some(true)),
+            (can_flag::TX_ECHO, 4, 3, Some(false)),
+            // A tool's number is a process id.
+            (can_flag::TX_ECHO, 0x34, 0x1234, Some(true)),
+            (can_flag::TX_ECHO, 3, 0x1200, Some(false)),
+        ] {
+            assert_eq!(frame(flags, sender).echo_of(writer), answer, "{flags} {sender} {writer}");
+        }
     }
 }

@@ -13,7 +13,9 @@ mod idle;
 mod latency;
 mod machine;
 mod modbus;
+mod modbus_gateway;
 mod modbus_lines;
+mod modbus_unit;
 mod recorder;
 mod restart;
 mod scan;
@@ -23,7 +25,7 @@ mod start;
 mod stats;
 
 use super::{print, println, table};
-use anyhow::Context as _;
+use anyhow::{Context as _, ensure};
 use clap::{Args, ValueEnum};
 use machine::{Machine, MachineMeter};
 use serde::{Deserialize, Serialize};
@@ -56,6 +58,10 @@ pub enum What {
     Bus,
     /// Modbus TCP answers beside libmodbus and pymodbus, gateway, RTU line
     Modbus,
+    #[value(hide = true)]
+    ModbusGateway,
+    #[value(hide = true)]
+    ModbusGatewayFifo,
     /// SDO, punctuality of the SYNC, process data, a network of 127 nodes
     Canopen,
     #[value(hide = true)]
@@ -96,6 +102,8 @@ impl What {
         Self::Restart,
         Self::Idle,
     ];
+    /// What `modbus` has done in processes of their own.
+    const MODBUS_PARTS: [Self; 2] = [Self::ModbusGateway, Self::ModbusGatewayFifo];
     /// What `canopen` consists of.
     const CANOPEN_PARTS: [Self; 5] =
         [Self::CanopenSdo, Self::CanopenSync, Self::CanopenSyncFifo, Self::CanopenPdo, Self::CanopenNetwork];
@@ -105,6 +113,8 @@ impl What {
             Self::Latency => "latency",
             Self::Bus => "bus",
             Self::Modbus => "modbus",
+            Self::ModbusGateway => "modbus-gateway",
+            Self::ModbusGatewayFifo => "modbus-gateway-fifo",
             Self::Canopen => "canopen",
             Self::CanopenSdo => "canopen-sdo",
             Self::CanopenSync => "canopen-sync",
@@ -211,6 +221,26 @@ impl Bench {
     fn note(&mut self, text: impl Into<String>) {
         self.notes.push(format!("{}: {}", self.what.name(), text.into()));
     }
+
+    /// Runs parts, each in a process of its own, and takes over their figures.
+    fn parts(&mut self, parts: &[What]) -> anyhow::Result<()> {
+        for part in parts {
+            let mut child = Command::new(stack::OWN_EXECUTABLE);
+            child.args(["--json", "bench", part.name()]).stdin(Stdio::null()).stderr(Stdio::inherit());
+            if let Some(seconds) = self.seconds {
+                child.args(["--seconds", &seconds.to_string()]);
+            }
+            let output = child.arg("--dir").arg(&self.dir).output().context("starting a part of the bench")?;
+            ensure!(output.status.success(), "{} could not be run, {}; see above", part.name(), output.status);
+            let report: Report =
+                serde_json::from_slice(&output.stdout).context("reading the report of a part")?;
+            let what = self.what.name();
+            let own = |figure| Figure { bench: what.to_owned(), ..figure };
+            self.figures.extend(report.figures.into_iter().map(own));
+            self.notes.extend(report.notes);
+        }
+        Ok(())
+    }
 }
 
 /// Runs one bench, or all of them.
@@ -233,6 +263,8 @@ fn one(args: &BenchArgs) -> anyhow::Result<Report> {
         What::Latency => latency::run,
         What::Bus => bus::run,
         What::Modbus => modbus::run,
+        What::ModbusGateway => modbus_gateway::other,
+        What::ModbusGatewayFifo => modbus_gateway::fifo,
         What::Canopen => canopen::run,
         What::CanopenSdo => canopen::sdo,
         What::CanopenSync => canopen::other,

@@ -6,6 +6,7 @@ mod build;
 pub mod can;
 pub mod canopen;
 mod check;
+pub mod completion;
 mod down;
 mod explain;
 mod logs;
@@ -20,14 +21,14 @@ mod replay;
 pub mod replay_slave;
 mod restart;
 pub mod serial;
+pub mod sources;
 mod status;
 mod top;
-mod trace;
+pub mod trace;
 mod up;
 
 use crate::cli::{Cli, Command};
 use crate::supervise::service_main;
-use std::io::Write;
 use std::process::ExitCode;
 
 /// Exit code of a command that did its work, but with data loss.
@@ -64,13 +65,9 @@ pub fn run(cli: Cli) -> ExitCode {
         Command::Plc { service, stack, command } => {
             done(plc::run(service.as_deref(), stack.as_deref(), command, json))
         }
-        Command::Build { files, output } => done(build::run(&files, &output, json)),
+        Command::Build { program, output } => done(build::run(&program, &output, json)),
         Command::Recordings(command) => recordings::run(command, json),
-        Command::Trace { files, case: Some(case), .. } => trace::against_case(&files, &case, json),
-        Command::Trace { files, cycle: Some(cycle), scans: Some(scans), set, .. } => {
-            trace::scans(&files, cycle, scans, &set, json)
-        }
-        Command::Trace { .. } => Err(UsageError("give --case, or --cycle and --scans".to_owned()).into()),
+        Command::Trace(args) => trace::run(&args, json),
         Command::Replay { ref file, ref service, ref slave, .. } if slave.as_slave => {
             replay_slave::run(file, service.as_deref(), slave, json)
         }
@@ -90,6 +87,11 @@ pub fn run(cli: Cli) -> ExitCode {
             print(&format!("{:#}\n", explain::schema()));
             Ok(ExitCode::SUCCESS)
         }
+        Command::Completion { shell } => {
+            completion::completion(shell);
+            Ok(ExitCode::SUCCESS)
+        }
+        Command::Man { folder } => done(completion::man(&folder)),
         Command::Bench(args) => bench::run(&args, json),
         Command::Service(args) => return service_main::run(&args),
         Command::Clean { root, parent } => return service_main::clean(&root, parent),
@@ -97,22 +99,17 @@ pub fn run(cli: Cli) -> ExitCode {
     match result {
         Ok(code) => code,
         Err(e) => {
+            let text = error_text(&e);
             if json {
-                print(&format!("{}\n", serde_json::json!({ "error": format!("{e:#}") })));
+                println(&serde_json::json!({ "error": text }).to_string());
             }
-            eprintln!("dinrail: {e:#}");
+            eprintln!("dinrail: {text}");
             if e.is::<UsageError>() { ExitCode::from(USAGE) } else { ExitCode::FAILURE }
         }
     }
 }
 
-/// Prints a result. A reader that went away (`| head`) is no error: the process ends quietly.
-pub fn print(text: &str) {
-    let mut out = std::io::stdout().lock();
-    if out.write_all(text.as_bytes()).and_then(|()| out.flush()).is_err() {
-        std::process::exit(0);
-    }
-}
+pub use crate::terminal::{error_text, print};
 
 /// [`print`] with a line end.
 pub fn println(text: &str) {

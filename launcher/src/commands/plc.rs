@@ -1,10 +1,18 @@
 //! `dinrail plc`: jobs for a PLC of a running stack.
+//!
+//! [`names`] knows its variables; [`read`] shows them, once or again and again; [`state`] is `plc status`;
+//! [`super::plc_write`] sets and forces.
 
-use super::plc_write::{check_all, force, write};
+mod names;
+mod read;
+mod state;
+
+use super::plc_write::{Kind, set};
 use super::{UsageError, println};
 use crate::cli::PlcCommand;
 use crate::supervise::client::{find, observe};
 use crate::supervise::jobs::{JobLine, choose};
+pub use names::{Names, Variable};
 use serde_json::{Value, json};
 use std::path::Path;
 use std::time::Duration;
@@ -18,47 +26,58 @@ pub fn run(
     command: PlcCommand,
     json: bool,
 ) -> anyhow::Result<()> {
-    let mut jobs = jobs_of(&command);
     let assignments = match &command {
         PlcCommand::Write { assignments } | PlcCommand::Force { assignments } => {
             assignments.iter().map(|text| assignment(text)).collect::<Result<Vec<_>, _>>()?
         }
         _ => Vec::new(),
     };
+    if let PlcCommand::Watch { every, .. } = &command {
+        read::check_period(*every)?;
+    }
     let running = find(stack)?;
     let mut ctx = observe(&running)?;
-    for job in &mut jobs {
-        name_as_stack_does(job, &ctx.stack.dir);
-    }
     let plc = choose(&ctx, "plc", service)?;
     let mut line = JobLine::open(&mut ctx, running, "plc", &plc)?;
-    let is_write = matches!(command, PlcCommand::Write { .. });
-    if !assignments.is_empty() {
-        let what = if is_write { "written" } else { "forced" };
-        let known = check_all(&ctx.stack, &mut line, &plc, &assignments, what)?;
-        if is_write {
-            return write(&mut ctx, &mut line, &plc, &assignments, known, json);
+    let names = |line: &mut JobLine| Names::fetch(&ctx, line, &plc);
+    match command {
+        PlcCommand::Read { variables } => read::once(&names(&mut line)?, &mut line, &variables, json),
+        PlcCommand::List { filter } => {
+            read::list(&names(&mut line)?, filter.as_deref(), json);
+            Ok(())
         }
-        return force(&mut line, &assignments, json);
-    }
-    for job in jobs {
-        let answer = line.ask(&job, LIMIT)?;
-        if json {
-            println(&answer.to_string());
-        } else {
-            println(&text_of(&job, &answer));
+        PlcCommand::Watch { variables, every, duration } => {
+            let wanted = read::Watch { variables: &variables, every, duration, json };
+            read::watch(&ctx, &mut line, &plc, &wanted)
+        }
+        PlcCommand::Write { .. } => {
+            let names = names(&mut line)?;
+            set(&mut ctx, &mut line, &plc, &names, &assignments, (Kind::Write, json))
+        }
+        PlcCommand::Force { .. } => {
+            let names = names(&mut line)?;
+            set(&mut ctx, &mut line, &plc, &names, &assignments, (Kind::Force, json))
+        }
+        PlcCommand::Status => {
+            let answer = line.ask(&json!({ "do": "status" }), LIMIT)?;
+            println(&if json { answer.to_string() } else { state::text(&plc, &answer) });
+            Ok(())
+        }
+        command => {
+            for mut job in jobs_of(&command) {
+                name_as_stack_does(&mut job, &ctx.stack.dir);
+                let answer = line.ask(&job, LIMIT)?;
+                println(&if json { answer.to_string() } else { text_of(&job, &answer) });
+            }
+            Ok(())
         }
     }
-    Ok(())
 }
 
-/// The jobs of a command, in order.
+/// The jobs of a command that nothing is to be found out for, in order.
 fn jobs_of(command: &PlcCommand) -> Vec<Value> {
     let plain = |what: &str| vec![json!({ "do": what })];
-    let each =
-        |what: &str, list: &[String]| list.iter().map(|var| json!({ "do": what, "var": var })).collect();
     match command {
-        PlcCommand::Status => plain("status"),
         PlcCommand::Stop => plain("stop"),
         PlcCommand::Run => plain("run"),
         PlcCommand::Cold => plain("cold"),
@@ -69,11 +88,16 @@ fn jobs_of(command: &PlcCommand) -> Vec<Value> {
             let path = std::path::absolute(program).unwrap_or_else(|_| program.clone());
             vec![json!({ "do": "load", "path": path, "cold": cold })]
         }
-        // See `plc_write`.
-        PlcCommand::Write { .. } | PlcCommand::Force { .. } => Vec::new(),
         PlcCommand::Unforce { all: true, .. } => plain("unforce_all"),
-        PlcCommand::Unforce { variables, .. } => each("unforce", variables),
-        PlcCommand::Read { variables } => each("read", variables),
+        PlcCommand::Unforce { variables, .. } => {
+            variables.iter().map(|var| json!({ "do": "unforce", "var": var })).collect()
+        }
+        PlcCommand::Status
+        | PlcCommand::Read { .. }
+        | PlcCommand::List { .. }
+        | PlcCommand::Watch { .. }
+        | PlcCommand::Write { .. }
+        | PlcCommand::Force { .. } => Vec::new(),
     }
 }
 
@@ -111,11 +135,7 @@ pub fn assignment(text: &str) -> Result<(String, Value), UsageError> {
 fn text_of(job: &Value, answer: &Value) -> String {
     let var = job.get("var").and_then(Value::as_str);
     match (var, answer) {
-        (Some(var), Value::Object(map)) if map.contains_key("value") => {
-            format!("{var} = {}", plain(&map["value"]))
-        }
         (Some(var), Value::Null | Value::Bool(_)) => format!("{var}: done"),
-        (Some(var), value) if !value.is_object() => format!("{var} = {}", plain(value)),
         (_, Value::Object(map)) => {
             map.iter().map(|(key, value)| format!("{key}: {}", plain(value))).collect::<Vec<_>>().join("\n")
         }
@@ -136,6 +156,62 @@ pub fn plain(value: &Value) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ipc_types::stack::{ServiceEntry, Stack};
+    use ipc_types::wiring::{Area, ImageRange, OnBad, Wiring};
+
+    pub const PROGRAM: &str = "TYPE Mode : (Off, Auto := 5); Axis : STRUCT pos : INT; busy : BOOL; END_STRUCT; END_TYPE
+PROGRAM Main
+VAR n : INT; mode : Mode := Auto; pause : TIME := T#500ms; hold : TON; table : ARRAY [1..3] OF INT; axis : ARRAY [0..1] OF Axis; END_VAR
+VAR RETAIN kept : INT; END_VAR
+n := n + 1; hold(IN := TRUE, PT := pause);
+END_PROGRAM
+";
+
+    /// `io` delivers %ID1 as `Level` and %IX0.3, and sends %QB1 as `Lamps`.
+    pub fn stack() -> Stack {
+        let range = |area, byte, bit, bytes, type_name: &str, symbol: Option<&str>| ImageRange {
+            area,
+            byte,
+            bit,
+            bytes,
+            type_name: Some(type_name.to_owned()),
+            symbol: symbol.map(str::to_owned),
+            label: String::new(),
+            key: "in[0]".to_owned(),
+            on_bad: OnBad::default(),
+            status_byte: None,
+        };
+        let wiring = Wiring {
+            plc: Some("plc".to_owned()),
+            inputs: vec![
+                range(Area::Input, 4, None, 4, "REAL", Some("Level")),
+                range(Area::Input, 0, Some(3), 1, "BOOL", None),
+            ],
+            outputs: vec![range(Area::Output, 1, None, 1, "USINT", Some("Lamps"))],
+            ..Wiring::default()
+        };
+        let service = |name: &str, kind: &str, index, config, wiring| ServiceEntry {
+            name: name.to_owned(),
+            kind: kind.to_owned(),
+            index,
+            config,
+            wiring,
+        };
+        Stack {
+            name: "s".to_owned(),
+            file: "s.toml".into(),
+            dir: ".".into(),
+            text: String::new(),
+            build_id: String::new(),
+            root: "/".into(),
+            prefix: String::new(),
+            services: vec![
+                service("plc", "plc", 1, json!({}), Wiring::default()),
+                service("io", "can-io", 2, Value::Null, wiring),
+            ],
+            topics: Vec::new(),
+        }
+    }
 
     #[test]
     fn assignments_are_taken_apart() {
@@ -157,14 +233,9 @@ mod tests {
 
     #[test]
     fn answers_are_readable() {
-        let job = json!({ "do": "read", "var": "x" });
-        assert_eq!(text_of(&job, &json!({ "value": true, "type": "BOOL" })), "x = TRUE");
         assert_eq!(text_of(&json!({ "do": "stop" }), &json!(true)), "done");
         let job = json!({ "do": "unforce", "var": "x" });
         assert_eq!(text_of(&job, &Value::Bool(true)), "x: done");
-        assert_eq!(
-            text_of(&json!({ "do": "status" }), &json!({ "state": "run", "scans": 7 })),
-            "scans: 7\nstate: run"
-        );
+        assert_eq!(text_of(&json!({ "do": "load" }), &json!({ "start": "warm" })), "start: warm");
     }
 }

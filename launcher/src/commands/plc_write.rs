@@ -4,6 +4,7 @@
 //! They go to the engine as one job. Where it cannot take them, because it knows no symbols of the stack file without a
 //! program or because they are too many, places in %Q and %M go as one message of image writes.
 
+use super::plc::Names;
 use super::{UsageError, println};
 use crate::supervise::jobs::{JobError, JobLine};
 use dinrail_iec::artifact::{AreaKind, ElemType, Storage};
@@ -50,35 +51,96 @@ const ELEMENTS: [ElemType; 16] = [
     ElemType::Time,
 ];
 
+/// What is done with the assignments.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    Write,
+    Force,
+}
+
+impl Kind {
+    fn word(self) -> &'static str {
+        match self {
+            Self::Write => "written",
+            Self::Force => "forced",
+        }
+    }
+}
+
+/// Carries out all assignments in one scan, or none. What would not last is remarked on stderr.
+pub fn set(
+    ctx: &mut Context,
+    line: &mut JobLine,
+    plc: &str,
+    names: &Names,
+    list: &[Assignment],
+    (kind, as_json): (Kind, bool),
+) -> anyhow::Result<()> {
+    let (list, known) = check_all(&ctx.stack, line, plc, names, list, kind)?;
+    match kind {
+        Kind::Write => write(ctx, line, plc, &list, known)?,
+        Kind::Force => {
+            let job = set_job("force", &list).ok_or_else(|| too_many("forced", list.len()))?;
+            ask(line, &job, &list, "forced")?;
+        }
+    }
+    tell(names, kind, &list, as_json);
+    if kind == Kind::Write {
+        for (var, _) in &list {
+            if let Some(owner) = names.input_owner(&ctx.stack, plc, var) {
+                eprintln!("dinrail: {}", fleeting(var, owner));
+            }
+        }
+    }
+    Ok(())
+}
+
+fn fleeting(var: &str, owner: &str) -> String {
+    format!(
+        "'{var}' is an input that service '{owner}' delivers: its next value takes the place of what was written; `dinrail plc force` holds it"
+    )
+}
+
 /// Asks the engine for every variable and compares its type with the value: nothing is carried out when one is wrong.
 ///
-/// Says whether the engine knows all of them. Without a program it does not know the stack file's symbols, but their
-/// places are known here.
-pub fn check_all(
+/// Hands over the assignments as the engine takes them, and whether it knows all of them: one of another version knows no
+/// symbols of the stack file without a program, but their places are known here.
+fn check_all(
     stack: &Stack,
     line: &mut JobLine,
     plc: &str,
+    names: &Names,
     list: &[Assignment],
-    what: &str,
-) -> anyhow::Result<bool> {
-    let (mut wrong, mut known) = (Vec::new(), true);
+    kind: Kind,
+) -> anyhow::Result<(Vec<Assignment>, bool)> {
+    let (mut good, mut wrong, mut known) = (Vec::new(), Vec::new(), true);
     for (var, value) in list {
+        let found = names.settable(var).and_then(|variable| Ok((variable.value(value)?, variable)));
+        let (value, variable) = match found {
+            Ok(found) => found,
+            Err(text) => {
+                wrong.push(text);
+                continue;
+            }
+        };
+        let var = &variable.path;
         match line.ask(&json!({ "do": "read", "var": var }), LIMIT) {
-            Ok(answer) => wrong.extend(misfit(var, value, &answer)),
+            Ok(answer) => wrong.extend(misfit(var, &value, &answer)),
             Err(JobError::Refused { text, .. }) => match place(stack, plc, var) {
                 Some((_, cell)) if !var.starts_with('%') => {
                     known = false;
-                    wrong.extend(cell.patch(var, value).err().map(|e| e.to_string()));
+                    wrong.extend(cell.patch(var, &value).err().map(|e| e.to_string()));
                 }
                 _ => wrong.push(text),
             },
             Err(other) => return Err(other.into()),
         }
+        good.push((var.clone(), value));
     }
     if wrong.is_empty() {
-        return Ok(known);
+        return Ok((good, known));
     }
-    let none = if list.len() > 1 { format!("nothing was {what}: ") } else { String::new() };
+    let none = if list.len() > 1 { format!("nothing was {}: ", kind.word()) } else { String::new() };
     anyhow::bail!("{none}{}", wrong.join("; "))
 }
 
@@ -100,29 +162,17 @@ enum Way {
     Message(Box<Builder>),
 }
 
-/// Carries out what [`check_all`] has found good; `known` is what it said.
-pub fn write(
+fn write(
     ctx: &mut Context,
     line: &mut JobLine,
     plc: &str,
     list: &[Assignment],
     known: bool,
-    as_json: bool,
 ) -> anyhow::Result<()> {
     match way(&ctx.stack, plc, list, known)? {
-        Way::Job(job) => ask(line, &job, list, "written")?,
-        Way::Message(builder) => send(ctx, plc, &builder)?,
+        Way::Job(job) => ask(line, &job, list, "written"),
+        Way::Message(builder) => send(ctx, plc, &builder),
     }
-    tell("written", list, as_json);
-    Ok(())
-}
-
-/// As [`write`], for `plc force`.
-pub fn force(line: &mut JobLine, list: &[Assignment], as_json: bool) -> anyhow::Result<()> {
-    let job = set_job("force", list).ok_or_else(|| too_many("forced", list.len()))?;
-    ask(line, &job, list, "forced")?;
-    tell("forced", list, as_json);
-    Ok(())
 }
 
 fn ask(line: &mut JobLine, job: &Value, list: &[Assignment], what: &str) -> anyhow::Result<()> {
@@ -135,15 +185,16 @@ fn ask(line: &mut JobLine, job: &Value, list: &[Assignment], what: &str) -> anyh
     }
 }
 
-fn tell(what: &str, list: &[Assignment], as_json: bool) {
+fn tell(names: &Names, kind: Kind, list: &[Assignment], as_json: bool) {
     if as_json {
         let done: Vec<Value> =
             list.iter().map(|(var, value)| json!({ "var": var, "value": value })).collect();
-        println(&json!({ what: done, "one_scan": true }).to_string());
-    } else {
-        for (var, value) in list {
-            println(&format!("{var} = {}", super::plc::plain(value)));
-        }
+        println(&json!({ kind.word(): done, "one_scan": true }).to_string());
+        return;
+    }
+    for (var, value) in list {
+        let text = names.settable(var).map_or_else(|_| super::plc::plain(value), |v| v.text(value));
+        println(&format!("{var} = {text}"));
     }
 }
 
@@ -463,6 +514,14 @@ Mask { area: Output, offset: 2, and: [247], or: [8] }
 'x' is TIME; "soon" does not fit: give milliseconds or a text like "1.5s"
 'x' is an array: write its elements, like x[1]
 "#);
+    }
+
+    #[test]
+    fn a_write_that_will_not_last_is_remarked() {
+        assert!(
+            fleeting("Level", "io").contains("service 'io' delivers")
+                && fleeting("x", "y").contains("plc force")
+        );
     }
 
     #[test]

@@ -4,6 +4,7 @@ use super::table;
 use crate::cli::Which;
 use crate::supervise::client::{Client, find};
 use crate::supervise::control::{Reply, Request, ServiceRow, StackStatus};
+use serde_json::{Value, json};
 use std::time::Duration;
 
 const LIMIT: Duration = Duration::from_secs(10);
@@ -15,6 +16,7 @@ pub fn run(which: &Which, json: bool) -> anyhow::Result<()> {
         anyhow::bail!("the launcher gave another answer than asked for; is it of another version?");
     };
     if json {
+        let rows: Vec<Value> = rows.iter().map(row_json).collect();
         super::println(&serde_json::to_string_pretty(&rows)?);
     } else {
         super::print(&rows_text(&rows));
@@ -22,12 +24,26 @@ pub fn run(which: &Which, json: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// A row for programs. What only a process has is null where there is none: nobody shall send signals to process 0.
+pub fn row_json(row: &ServiceRow) -> Value {
+    let mut value = json!(row);
+    if row.pid == 0 {
+        for key in ["pid", "health", "uptime_ms", "cpu_percent", "rss_bytes"] {
+            value[key] = Value::Null;
+        }
+    }
+    value
+}
+
 fn rows_text(rows: &[ServiceRow]) -> String {
     let head = ["SERVICE", "KIND", "PID", "STATE", "GEN", "RESTARTS", "UPTIME", "CPU", "MEMORY"];
     let cells = |row: &ServiceRow| {
         let none = || "-".to_owned();
         let lives = row.pid != 0;
-        let state = if row.state == "running" { row.health.clone() } else { row.state.clone() };
+        let mut state = if row.state == "running" { row.health.clone() } else { row.state.clone() };
+        if row.unstable && row.state != "held" {
+            state += ", unstable";
+        }
         vec![
             row.service.clone(),
             row.kind.clone(),
@@ -81,14 +97,25 @@ mod tests {
             uptime_ms: 185_000,
             cpu_percent: 1.25,
             rss_bytes: 5 << 20,
+            deaths: 0,
+            unstable: false,
         };
-        let held = ServiceRow { state: "held".into(), pid: 0, ..row.clone() };
+        let held = ServiceRow { state: "held".into(), pid: 0, unstable: true, ..row.clone() };
         assert_eq!(
-            rows_text(&[row, held]),
+            rows_text(&[row.clone(), held]),
             "SERVICE  KIND  PID  STATE  GEN  RESTARTS  UPTIME     CPU    MEMORY\n\
              can0     can   42   ready  2    1         3 min 5 s  1.2 %  5.0 MiB\n\
              can0     can   -    held   2    1         -          -      -\n"
         );
+        let (lives, none) = (row_json(&row), row_json(&ServiceRow { pid: 0, ..row.clone() }));
+        assert_eq!((&lives["pid"], &lives["health"]), (&json!(42), &json!("ready")));
+        assert_eq!(
+            (&none["pid"], &none["health"], &none["uptime_ms"]),
+            (&Value::Null, &Value::Null, &Value::Null)
+        );
+        assert_eq!((&none["service"], &none["restarts"]), (&json!("can0"), &json!(1)));
+        let unstable = rows_text(&[ServiceRow { unstable: true, ..row }]);
+        assert!(unstable.contains("  ready, unstable  2  "), "{unstable}");
     }
 
     #[test]

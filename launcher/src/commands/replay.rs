@@ -26,9 +26,28 @@ pub struct Verify<'a> {
     pub service: Option<&'a str>,
 }
 
-/// Exit code 0: exact; 1: different, the first difference is printed; 3: exact as far as it could be verified,
-/// the rest is listed.
+/// Exit code 0: exact, and the recording is whole; 1: different, the first difference is printed; 3: exact as far as it could
+/// be verified, the rest is listed, or what makes that more is missing than can be listed.
 pub fn verify(what: &Verify<'_>, json: bool) -> anyhow::Result<ExitCode> {
+    let (service, report, missing) = run(what)?;
+    for program in missing {
+        eprintln!(
+            "dinrail: program {program} is not in the recording as it ran: its scans cannot be verified"
+        );
+    }
+    if json {
+        let mut value = serde_json::to_value(&report)?;
+        value["service"] = service.into();
+        value["exit_code"] = report.exit_code().into();
+        println(&value.to_string());
+    } else {
+        println(&text_of(&report, &service, what.program.is_empty()));
+    }
+    Ok(ExitCode::from(report.exit_code()))
+}
+
+/// Verifies; the service, what came out, and the programs that were not to be had.
+fn run(what: &Verify<'_>) -> anyhow::Result<(String, Report, Vec<String>)> {
     let shown = what.file.display();
     let service = choose(what.file, what.service)?;
     let files = attachments(what.file)?;
@@ -55,25 +74,9 @@ pub fn verify(what: &Verify<'_>, json: bool) -> anyhow::Result<ExitCode> {
         }
         verifier = verifier.compare(other.program);
     }
-    let broken = feed(&mut verifier, what.file, &service)?;
+    feed(&mut verifier, what.file, &service)?;
     let report = verifier.finish()?;
-    for program in missing.borrow().iter() {
-        eprintln!(
-            "dinrail: program {program} is not in the recording as it ran: its scans cannot be verified"
-        );
-    }
-    if let Some(why) = &broken {
-        eprintln!("dinrail: {shown} ends early: {why}");
-    }
-    if json {
-        let mut value = serde_json::to_value(&report)?;
-        value["service"] = service.into();
-        value["exit_code"] = report.exit_code().into();
-        println(&value.to_string());
-    } else {
-        println(&text_of(&report, &service, what.program.is_empty()));
-    }
-    Ok(ExitCode::from(report.exit_code()))
+    Ok((service, report, missing.into_inner()))
 }
 
 /// The plc service meant: the one named, or the only one in the recording.
@@ -91,22 +94,31 @@ fn choose(file: &Path, named: Option<&str>) -> anyhow::Result<String> {
     }
 }
 
-/// Joins parts to contents and hands them over. Returns why the file ended early, if it did.
-fn feed(verifier: &mut Verifier<'_>, file: &Path, service: &str) -> anyhow::Result<Option<String>> {
+/// Joins parts to contents and hands them over, with every doubt about the file being whole.
+fn feed(verifier: &mut Verifier<'_>, file: &Path, service: &str) -> anyhow::Result<()> {
     let mut contents = scan_contents(file, service)?;
     let (mut scans, mut keyframes) = (Joiner::new(MAX_RECORD_BYTES), Joiner::new(MAX_KEYFRAME_BYTES));
+    let mut half = None;
     for message in contents.by_ref() {
         let ScanMessage { keyframe, header, tail, .. } = message?;
         let step = if keyframe { keyframes.push(&header, &tail) } else { scans.push(&header, &tail) };
-        if let Some(gap) = step.gap {
-            verifier.gap(gap.messages);
+        if !keyframe {
+            half = step.whole.is_none().then_some(header.scan);
+            if let Some(gap) = step.gap {
+                verifier.gap(gap.messages);
+            }
         }
         if let Some(whole) = step.whole {
             verifier.push(whole.generation, whole.bytes)?;
         }
     }
-    let end = contents.end();
-    Ok((!end.finished).then(|| end.reason.clone()).flatten())
+    if let Some(scan) = half {
+        verifier.doubt(format!("the last record, of scan {scan}, is not whole"));
+    }
+    for doubt in contents.integrity().doubts(contents.end(), service) {
+        verifier.doubt(doubt);
+    }
+    Ok(())
 }
 
 /// What the recorded engine was set up with, from the first keyframe.
@@ -216,6 +228,9 @@ fn text_of(report: &Report, service: &str, recorded_program: bool) -> String {
             span.from, span.to, span.generation, span.reason
         );
     }
+    for why in &report.incomplete {
+        text += &format!("\nnot complete: {why}");
+    }
     text += match report.exit_code() {
         0 => "\nexact",
         1 => "\ndifferent",
@@ -225,16 +240,4 @@ fn text_of(report: &Report, service: &str, recorded_program: bool) -> String {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_combination_of_versions_is_tried_newest_first() {
-        let (a, b, c) = (1, 2, 3);
-        assert_eq!(combinations(&[vec![&a, &b], vec![&c]]), [[&a, &c], [&b, &c]]);
-        assert!(combinations::<i32>(&[]).is_empty());
-        assert!(combinations(&[vec![&a], vec![]]).is_empty());
-        let many = vec![&a; 100];
-        assert_eq!(combinations(&[many.clone(), many]).len(), COMBINATIONS_MAX);
-    }
-}
+mod tests;

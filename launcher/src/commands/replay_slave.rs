@@ -4,7 +4,7 @@ use super::serial::{LineArgs, open_config, step};
 use super::{UsageError, println};
 use clap::{Args, ValueEnum};
 use dinrail_recorder::format::STACK_TEXT;
-use dinrail_recorder::reader::{Item, Recording};
+use dinrail_recorder::reader::{End, Item, Recording};
 use dinrail_recorder::scan::attachments;
 use dinrail_serial::Config;
 use dinrail_serial::dialog::{Builder, Dialog, Side};
@@ -107,7 +107,7 @@ pub fn run(file: &Path, service: Option<&str>, args: &SlaveArgs, json: bool) -> 
 }
 
 /// Calls `f` with every chunk of a line, in the order of the recording.
-fn chunks(file: &Path, service: &str, mut f: impl FnMut(&SerialChunk, &[u8])) -> anyhow::Result<()> {
+fn chunks(file: &Path, service: &str, mut f: impl FnMut(&SerialChunk, &[u8])) -> anyhow::Result<End> {
     let topic = TopicKind::SerialRx.of(service);
     let mut recording = Recording::open(file)?;
     while let Some(item) = recording.next_item()? {
@@ -119,7 +119,7 @@ fn chunks(file: &Path, service: &str, mut f: impl FnMut(&SerialChunk, &[u8])) ->
             f(&header, message.tail);
         }
     }
-    Ok(())
+    Ok(recording.end().clone())
 }
 
 /// The line meant: the one named, or the only one in the recording.
@@ -162,7 +162,14 @@ fn guess(file: &Path, service: &str) -> anyhow::Result<Side> {
 
 fn build(file: &Path, service: &str, side: Side) -> anyhow::Result<(Dialog, (u64, u64))> {
     let mut builder = Builder::new(side);
-    chunks(file, service, |header, bytes| builder.push(header, bytes))?;
+    let end = chunks(file, service, |header, bytes| builder.push(header, bytes))?;
+    if end.damaged > 0 || end.unread > 0 {
+        let (bytes, why) = (end.damaged_bytes + end.unread, end.reason.as_deref().unwrap_or("damaged"));
+        eprintln!(
+            "dinrail: {}: {bytes} bytes could not be read ({why}): answers may be missing",
+            file.display()
+        );
+    }
     let seen = builder.seen();
     Ok((builder.finish(), seen))
 }
@@ -244,7 +251,7 @@ fn serve(
             answer.clear();
             let mut due_ns = t_ns;
             for frame in frames {
-                due_ns += frame.delay_ns;
+                due_ns = due_ns.saturating_add(frame.delay_ns);
                 answer.extend(frame.bytes.chunks(CHUNK_BYTES).map(|part| (due_ns, part.to_vec())));
             }
         }

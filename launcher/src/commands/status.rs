@@ -1,6 +1,6 @@
 //! `dinrail status`: how the stack is, and what its services tell about themselves.
 
-use super::ps::{fetch_status, uptime};
+use super::ps::{fetch_status, row_json, uptime};
 use super::top::feed::{Feed, FeedError, Snapshot, Told};
 use super::{print, table};
 use crate::cli::Which;
@@ -65,7 +65,7 @@ pub fn run(which: &Which, wanted: &Wanted<'_>) -> anyhow::Result<ExitCode> {
             print(&text);
             return Ok(code(&snapshot));
         }
-        print(&frame(&text, first, wanted.json));
+        show_frame(&text, first, wanted.json);
         first = false;
         if reactor.wait(Some(WATCH))?.contains(&stop) {
             return Ok(ExitCode::SUCCESS);
@@ -89,15 +89,12 @@ fn code(snapshot: &Snapshot) -> ExitCode {
 }
 
 /// A screen of `--watch`: over the last one on a terminal, else below it.
-fn frame(text: &str, first: bool, json: bool) -> String {
+fn show_frame(text: &str, first: bool, json: bool) {
     use std::io::IsTerminal;
-    if json {
-        return text.to_owned();
+    if std::io::stdout().is_terminal() && !json {
+        return crate::terminal::print_screen(text);
     }
-    if std::io::stdout().is_terminal() {
-        return format!("\x1b[H\x1b[2J{text}");
-    }
-    if first { text.to_owned() } else { format!("\n{text}") }
+    print(&if first || json { text.to_owned() } else { format!("\n{text}") });
 }
 
 fn choose(has: &[&str], asked: &[String]) -> anyhow::Result<Vec<String>> {
@@ -132,7 +129,7 @@ fn to_json(snapshot: &Snapshot, services: &[String]) -> Value {
         .filter(|r| services.contains(&r.service))
         .map(|row| {
             let told = snapshot.told.iter().find(|t| t.service == row.service);
-            let mut entry = json!(row);
+            let mut entry = row_json(row);
             entry["status"] = told.map_or(Value::Null, |t| t.body.clone());
             entry["status_age_ms"] = told.map_or(Value::Null, |t| json!(age_ms(t, snapshot.t_ns)));
             entry
@@ -164,6 +161,12 @@ pub(super) fn stack_text(s: &StackStatus) -> String {
         let names = s.held.join(", ");
         text += &format!(
             "\nheld, not started again: {names}; `dinrail logs SERVICE` says why, `dinrail restart SERVICE` starts it"
+        );
+    }
+    if !s.unstable.is_empty() {
+        let names = s.unstable.join(", ");
+        text += &format!(
+            "\nunstable, dies again and again: {names}; `dinrail logs SERVICE` says why; forgotten after a minute's good run"
         );
     }
     if let Some(why) = &s.failed {
@@ -362,6 +365,8 @@ mod tests {
         let text = stack_text(&stack);
         assert!(text.contains("\nheld, not started again: io; `dinrail logs SERVICE`"), "{text}");
         assert!(!text.contains("too many"), "{text}");
+        stack.unstable = vec!["plc".into()];
+        assert!(stack_text(&stack).contains("\nunstable, dies again and again: plc; "));
     }
 
     #[test]

@@ -1,10 +1,13 @@
 //! `dinrail trace`: a program in virtual time.
 
 use super::plc::{assignment, plain};
+use super::sources::{Program, ProgramArgs};
 use super::{UsageError, println};
 use anyhow::Context as _;
-use dinrail_iec::Source;
-use dinrail_plc::trace::{CaseReport, ScanTrace, Setting, trace_case, trace_scans};
+use clap::Args;
+use dinrail_plc::program::ProgramError;
+use dinrail_plc::setup::Setup;
+use dinrail_plc::trace::{CaseReport, ScanTrace, Setting, TraceError, trace_case, trace_scans};
 use ipc_types::units::Span;
 use serde_json::{Map, Value};
 use std::path::{Path, PathBuf};
@@ -13,11 +16,56 @@ use std::process::ExitCode;
 /// Most scans of one trace: every variable of each is kept.
 const SCANS_MAX: u64 = 1_000_000;
 
+/// What to run.
+#[derive(Debug, Args)]
+pub struct TraceArgs {
+    #[command(flatten)]
+    program: ProgramArgs,
+    /// Inputs and expected values (JSON); exit 1 at the first difference
+    #[arg(long, conflicts_with_all = ["cycle", "scans", "set"])]
+    case: Option<PathBuf>,
+    /// Time between scans; with --stack its plc's when left out
+    #[arg(long, value_name = "DURATION", required_unless_present_any = ["case", "stack"])]
+    cycle: Option<Span>,
+    /// Number of scans
+    #[arg(long, required_unless_present = "case")]
+    scans: Option<u64>,
+    /// Set a variable before a scan; the first scan is 1
+    #[arg(long, value_name = "SCAN:VAR=VALUE")]
+    set: Vec<String>,
+}
+
+pub fn run(args: &TraceArgs, json: bool) -> anyhow::Result<ExitCode> {
+    match (&args.case, args.scans) {
+        (Some(case), _) => against_case(&args.program, case, json),
+        (None, Some(scans)) => self::scans(args, scans, json),
+        (None, None) => Err(UsageError("give --case, or --cycle and --scans".to_owned()).into()),
+    }
+}
+
+/// Nothing delivers inputs here and no event comes: both are set, or stay as they are.
+fn setup_of(program: &Program) -> Setup {
+    Setup { inputs: Vec::new(), trigger: None, cycle_ns: None, ..program.setup.clone() }
+}
+
+/// What the compiler says comes first, as it is.
+fn told(program: &Program, error: TraceError) -> anyhow::Error {
+    match error {
+        TraceError::Program(ProgramError::Compile(shown)) => {
+            eprintln!("{}", shown.trim_end());
+            anyhow::anyhow!("the program does not compile{}", program.advice(&shown))
+        }
+        error => error.into(),
+    }
+}
+
 /// Runs a program against a case. Exit code 0 = all values as expected, 1 = the first difference is printed.
-pub fn against_case(files: &[PathBuf], case: &Path, json: bool) -> anyhow::Result<ExitCode> {
-    let sources = sources_of(files)?;
+fn against_case(program: &ProgramArgs, case: &Path, json: bool) -> anyhow::Result<ExitCode> {
+    let program = Program::read(program)?;
     let text = std::fs::read_to_string(case).with_context(|| format!("cannot read {}", case.display()))?;
-    let report = trace_case(sources, &text).with_context(|| case.display().to_string())?;
+    let report = trace_case(program.sources.clone(), setup_of(&program), &text)
+        .map_err(|e| told(&program, e))
+        .with_context(|| case.display().to_string())?;
     if let Some(warnings) = &report.warnings {
         eprintln!("{warnings}");
     }
@@ -46,24 +94,21 @@ fn case_text(report: &CaseReport) -> String {
 
 /// Runs a program for so many scans and prints every variable after each, in text only those that changed.
 /// Exit code 1 when the program faulted.
-pub fn scans(
-    files: &[PathBuf],
-    cycle: Span,
-    scans: u64,
-    set: &[String],
-    json: bool,
-) -> anyhow::Result<ExitCode> {
-    if cycle.ns() == 0 {
+fn scans(args: &TraceArgs, scans: u64, json: bool) -> anyhow::Result<ExitCode> {
+    if args.cycle.is_some_and(|cycle| cycle.ns() == 0) {
         return Err(UsageError("--cycle 0: write the time between scans, for example 10ms".to_owned()).into());
     }
     if scans == 0 || scans > SCANS_MAX {
         return Err(UsageError(format!("--scans {scans}: write 1 to {SCANS_MAX}")).into());
     }
-    let settings = set.iter().map(|text| setting(text)).collect::<Result<Vec<_>, _>>()?;
+    let settings = args.set.iter().map(|text| setting(text)).collect::<Result<Vec<_>, _>>()?;
     if let Some(late) = settings.iter().find(|s| s.scan > scans) {
         return Err(UsageError(format!("--set {}:..: there are only {scans} scans", late.scan)).into());
     }
-    let trace = trace_scans(sources_of(files)?, Some(cycle.ns()), scans, &settings)?;
+    let program = Program::read(&args.program)?;
+    let cycle_ns = args.cycle.map(|cycle| cycle.ns()).or(program.setup.cycle_ns);
+    let trace = trace_scans(program.sources.clone(), setup_of(&program), cycle_ns, scans, &settings)
+        .map_err(|e| told(&program, e))?;
     let mut before = Map::new();
     for scan in &trace {
         if json {
@@ -96,10 +141,6 @@ fn setting(text: &str) -> Result<Setting, UsageError> {
     };
     let (variable, value) = assignment(rest)?;
     Ok(Setting { scan, variable, value })
-}
-
-fn sources_of(files: &[PathBuf]) -> anyhow::Result<Vec<Source>> {
-    super::build::read_sources(files)
 }
 
 #[cfg(test)]

@@ -29,7 +29,12 @@ pub const CANOPEN_MASTER: &[KeyDoc] = &[
         "0",
         "The SYNC carries a counter from 1 to this value (1019h); 0 = no counter.",
     ),
-    with("sync_cob_id", Int(1, 2047), "0x80", "COB-ID of the SYNC (1005h)."),
+    with(
+        "sync_cob_id",
+        Int(1, 2047),
+        "0x80",
+        "COB-ID of the SYNC (1005h): 0x80, 0x181 to 0x57F or 0x680 to 0x6DF. Written to nodes whose EDS has another.",
+    ),
     may("time_period", Duration, "no TIME", "Time between two TIME messages (1012h)."),
     with(
         "heartbeat",

@@ -217,14 +217,14 @@ pub const SERVICE_DOCS: &[KeyDoc] = &[
         "restart.max",
         Int(0, u32::MAX as i64),
         "5",
-        "Restarts allowed within `restart.within`; 0 = it is never started again.",
+        "Restarts allowed within `restart.within`, and failed starts in a row; 0 = it is never started again.",
     ),
     with("restart.within", Duration, "\"10s\"", "The time in which `restart.max` restarts are allowed."),
     with(
         "restart.backoff_first",
         Duration,
         "\"50ms\"",
-        "Wait before the second restart in a row; doubled for each further one.",
+        "Wait before the second restart since it was ready for a minute; doubled for each further one.",
     ),
     with("restart.backoff_max", Duration, "\"5s\"", "Longest wait before a restart."),
     with(

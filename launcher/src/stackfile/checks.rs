@@ -2,8 +2,10 @@
 //! missing files, more shared memory than there is. Then what each service finds by itself.
 
 use super::document::Document;
+use super::keypath;
 use super::place::Sink;
 use super::resolve::{PLC, exchangers};
+use dinrail_iec::lexer::TokenKind;
 use ipc_types::plc_table;
 use ipc_types::stack::{Severity, Stack};
 use ipc_types::wiring::{Area, ImageRange};
@@ -36,8 +38,14 @@ struct Point<'a> {
     range: &'a ImageRange,
     /// Owned (inputs) or read (outputs).
     owned: bool,
-    place: std::ops::Range<usize>,
+    place: Span,
+    /// Where its symbol stands.
+    symbol: Span,
+    /// Where its status byte stands.
+    status: Span,
 }
+
+type Span = std::ops::Range<usize>;
 
 impl Point<'_> {
     /// `'in[2].to' of service 'io' (line 12, id 123h bits 0..15)`.
@@ -59,10 +67,21 @@ fn points_of<'a>(document: &Document, stack: &'a Stack, plc: &str) -> Vec<Point<
             wiring.inputs.iter().map(|r| (r, true)).chain(wiring.outputs.iter().map(|r| (r, false)))
         {
             let place = document.place(&entry.name, &range.key);
-            points.push(Point { service: &entry.name, range, owned, place });
+            let beside = |name| beside(document, &entry.name, &range.key, name).unwrap_or_else(|| place.clone());
+            let (symbol, status) = (beside("symbol"), beside("status_to"));
+            points.push(Point { service: &entry.name, range, owned, place, symbol, status });
         }
     }
     points
+}
+
+/// Where another key of the same table stands, if it is there.
+fn beside(document: &Document, service: &str, key: &str, name: &str) -> Option<Span> {
+    let table = &document.service(service)?.table;
+    let parent = key.rsplit_once('.').map_or("", |(parent, _)| parent);
+    let place = keypath::span_of(table, &format!("{parent}.{name}"))?;
+    // What is not there leads to the table.
+    (Some(&place) != keypath::span_of(table, parent).as_ref()).then_some(place)
 }
 
 /// First bit and bit behind the last one.
@@ -167,7 +186,7 @@ fn inside(points: &[Point<'_>], plc: &str, config: &serde_json::Value, sink: &mu
             );
         } else if point.owned && status_end > size {
             sink.error(
-                &point.place,
+                &point.status,
                 format!(
                     "status %IB{} lies beyond %I of '{plc}', which ends at %IB{}",
                     status_end - 1,
@@ -187,6 +206,14 @@ fn symbols(points: &[Point<'_>], sink: &mut Sink<'_>) {
     let mut seen: HashMap<String, &Point<'_>> = HashMap::new();
     for point in points {
         let Some(symbol) = &point.range.symbol else { continue };
+        if let Some(fault) = symbol_fault(symbol) {
+            sink.error(
+                &point.symbol,
+                format!("symbol '{}' {fault}", symbol.escape_debug()),
+                "a symbol is a variable of the program: letters, digits and single _, not beginning with a digit",
+            );
+            continue;
+        }
         // IEC names ignore case.
         let Some(first) = seen.insert(symbol.to_ascii_lowercase(), point) else { continue };
         if bits(first.range) == bits(point.range) && first.range.area == point.range.area {
@@ -197,7 +224,23 @@ fn symbols(points: &[Point<'_>], sink: &mut Sink<'_>) {
             first.describe(sink),
             point.describe(sink)
         );
-        sink.error(&point.place, message, "give one of them another name; upper and lower case are the same");
+        sink.error(&point.symbol, message, "give one of them another name; upper and lower case are the same");
+    }
+}
+
+/// Why a name cannot be one of the program's variables.
+fn symbol_fault(name: &str) -> Option<&'static str> {
+    let (tokens, faults) = dinrail_iec::lexer::lex(0, name);
+    match tokens.first() {
+        Some(token) if !faults.is_empty() || token.start != 0 || token.end as usize != name.len() => {
+            Some("is no name of IEC 61131-3")
+        }
+        Some(token) => match token.kind {
+            TokenKind::Word(None) => None,
+            TokenKind::Word(Some(_)) => Some("is a word of the language"),
+            _ => Some("is no name of IEC 61131-3"),
+        },
+        None => Some("is no name of IEC 61131-3"),
     }
 }
 

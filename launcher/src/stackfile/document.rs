@@ -61,6 +61,10 @@ pub fn read(text: &str, kinds: &'static [Kind], sink: &mut Sink<'_>) -> Option<D
         Ok(toml) => toml,
         Err(error) => {
             let span = error.span().unwrap_or(text.len()..text.len());
+            if let Some((span, message, help)) = common_slip(text, &span) {
+                sink.error(&span, message, help);
+                return None;
+            }
             let mut lines = error.message().lines().map(str::trim).filter(|l| !l.is_empty());
             let first = lines.next().unwrap_or("the text cannot be read");
             let rest: Vec<&str> = lines.collect();
@@ -89,6 +93,45 @@ pub fn read(text: &str, kinds: &'static [Kind], sink: &mut Sink<'_>) -> Option<D
     let (name, table) = stack?;
     Some(Document { name, settings: table.settings(), services })
 }
+
+/// Slips of people who see TOML for the first time: place, what is wrong, what to write.
+fn common_slip(text: &str, span: &Range<usize>) -> Option<(Range<usize>, String, String)> {
+    // One bracket makes a table that can be there only once: the parser complains about the next one.
+    let mut at = 0;
+    for line in text.split_inclusive('\n') {
+        let header: String =
+            line.split('#').next().unwrap_or_default().chars().filter(|c| !c.is_whitespace()).collect();
+        if header == "[service]" {
+            let start = at + line.len() - line.trim_start().len();
+            return Some((
+                start..start + line.trim().len(),
+                "'service' is no list of tables".to_owned(),
+                ONE_BRACKET.to_owned(),
+            ));
+        }
+        at += line.len();
+    }
+    let at = text.floor_char_boundary(span.start.min(text.len()));
+    let start = text[..at].rfind('\n').map_or(0, |i| i + 1);
+    let line = text[start..].lines().next().unwrap_or_default();
+    let (key, value) = line.split_once('=')?;
+    let plain = |c: char| c.is_alphanumeric() || matches!(c, '_' | '-' | '.' | ':' | '/' | '%');
+    let word = value.split('#').next().unwrap_or_default().trim();
+    let bare = word.starts_with(|c: char| c.is_alphabetic() || matches!(c, '/' | '%')) && word.chars().all(plain);
+    let key = key.trim();
+    if !bare || key.is_empty() || !key.chars().all(plain) || ["true", "false", "inf", "nan"].contains(&word) {
+        return None;
+    }
+    let from = start + line.find(word)?.max(line.find('=')?);
+    let from = from + text[from..].find(word)?;
+    Some((
+        from..from + word.len(),
+        format!("the value of '{key}' is a text without quotes"),
+        format!("write {key} = \"{word}\""),
+    ))
+}
+
+const ONE_BRACKET: &str = "write [[service]] with two brackets for each service";
 
 fn read_stack(root: &Table, sink: &mut Sink<'_>) -> Option<(String, StackTable)> {
     let table = match root.get("stack") {
@@ -119,7 +162,7 @@ fn read_stack(root: &Table, sink: &mut Sink<'_>) -> Option<(String, StackTable)>
         return None;
     }
     let name_span = keypath::span_of(&table, "name").unwrap_or_else(|| header.clone());
-    let scope = Scope { what: "[stack]", explain: "stack", keys: STACK_DOCS, more_keys: &[], place: header };
+    let scope = Scope { what: "[stack]", explain: "stack", keys: STACK_DOCS, more_keys: &[], kinds: &[], place: header };
     let stack: StackTable =
         read_table(table, &scope, sink, |t| toml_edit::de::from_document(DocumentMut::from(t)))?;
     if let Some(fault) = name_fault(&stack.name) {
@@ -161,7 +204,7 @@ fn read_services(
             sink.error(
                 &span,
                 "'service' is no list of tables",
-                "write [[service]] with two brackets for each service",
+                ONE_BRACKET,
             );
             return Vec::new();
         }
@@ -293,6 +336,7 @@ impl ServiceReader<'_, '_> {
             explain: kind.name,
             keys: kind.config_doc,
             more_keys: &SERVICE_KEYS,
+            kinds: self.kinds,
             place: self.header.clone(),
         };
         let config = read_table(own.clone(), &scope, self.sink, kind.parse)?;
@@ -312,8 +356,8 @@ impl ServiceReader<'_, '_> {
     }
 
     fn launch(&mut self, table: Table, what: &str, stack: Option<&StackTable>) -> Option<LaunchOptions> {
-        let scope =
-            Scope { what, explain: "", keys: SERVICE_DOCS, more_keys: &[], place: self.header.clone() };
+        let place = self.header.clone();
+        let scope = Scope { what, explain: "", keys: SERVICE_DOCS, more_keys: &[], kinds: &[], place };
         let launch: LaunchTable = read_table(table.clone(), &scope, self.sink, |t| {
             toml_edit::de::from_document(DocumentMut::from(t))
         })?;

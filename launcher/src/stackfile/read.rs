@@ -4,6 +4,7 @@ use super::keypath;
 use super::nearest::{nearest, suggestion};
 use super::place::Sink;
 use crate::explain_keys::{KeyDoc, find_key};
+use crate::kinds::Kind;
 use std::ops::Range;
 use toml_edit::de::Error;
 use toml_edit::{Item, Table, Value};
@@ -21,6 +22,8 @@ pub struct Scope<'a> {
     pub keys: &'a [KeyDoc],
     /// Keys beyond those of the type that are right at the top of the table.
     pub more_keys: &'a [&'a str],
+    /// Kinds whose key this may be, written below the wrong service.
+    pub kinds: &'static [Kind],
     /// Where to point when the key itself is not known: the header.
     pub place: Range<usize>,
 }
@@ -76,11 +79,9 @@ fn report(error: &Error, table: &Table, scope: &Scope<'_>, sink: &mut Sink<'_>) 
             keys.extend(scope.more_keys.iter().filter(|key| **key != "exec"));
         }
         let place = if parent.is_empty() { what.to_owned() } else { format!("{what}, table '{parent}'") };
-        sink.error(
-            &span,
-            format!("unknown key '{name}' in {place}"),
-            suggestion(name, "keys here", keys.iter().copied()),
-        );
+        let help = suggestion(name, "keys here", keys.iter().copied());
+        let strayed = if parent.is_empty() { strayed(name, table, scope.kinds) } else { None };
+        sink.error(&span, format!("unknown key '{name}' in {place}"), strayed.unwrap_or(help));
         return;
     }
     if message.starts_with("missing field") {
@@ -101,10 +102,21 @@ fn report(error: &Error, table: &Table, scope: &Scope<'_>, sink: &mut Sink<'_>) 
         );
         return;
     }
+    let help = key_help(&path, scope);
     let sentence = match message.split_once(", expected ") {
         Some((found, wanted)) if found.starts_with("invalid") => {
             let found = found.split_once(": ").map_or(found, |(_, f)| f).replace('`', "");
-            format!("{key}: expected {}, found {found}", wanted_text(wanted))
+            let wanted = match wanted_text(wanted) {
+                // The type's range only contradicts the key's own.
+                number if number.starts_with("a whole number") && help.contains("Takes ") => {
+                    "a whole number".to_owned()
+                }
+                other => other,
+            };
+            format!("{key}: expected {wanted}, found {found}")
+        }
+        _ if message.starts_with("invalid socket address") => {
+            format!("{key}: {}", address_fault(sink.source.text.get(span.clone()).unwrap_or_default()))
         }
         // An untagged form says only what it takes.
         _ if message.starts_with("an ") || message.starts_with("a ") || message.starts_with('"') => {
@@ -112,7 +124,44 @@ fn report(error: &Error, table: &Table, scope: &Scope<'_>, sink: &mut Sink<'_>) 
         }
         _ => format!("{key}: {}", message.trim_end()),
     };
-    sink.error(&span, sentence, key_help(&path, scope));
+    sink.error(&span, sentence, help);
+}
+
+/// What a text lacks to be an address and a port.
+fn address_fault(quoted: &str) -> String {
+    let text = quoted.trim_matches(['"', '\'']);
+    match text.rsplit_once(':') {
+        Some((host, port)) if port.parse::<u16>().is_ok() && host.contains(|c: char| c.is_ascii_alphabetic()) => {
+            format!("'{host}' is no IP address; names of hosts are not supported, write the number")
+        }
+        _ if text.parse::<std::net::IpAddr>().is_ok() => {
+            format!("the port is missing: write \"{}\"", match text.contains(':') {
+                true => format!("[{text}]:PORT"),
+                false => format!("{text}:PORT"),
+            })
+        }
+        _ => "expected an address and a port, as \"192.168.0.10:502\"".to_owned(),
+    }
+}
+
+/// Help for a table that other kinds have: in TOML it belongs to the last `[[service]]` before it.
+fn strayed(name: &str, table: &Table, kinds: &[Kind]) -> Option<String> {
+    let brackets = match table.get(name)? {
+        Item::ArrayOfTables(_) => ["[[", "]]"],
+        Item::Table(_) => ["[", "]"],
+        _ => return None,
+    };
+    let top = |key: &'static str| key.split(['.', '[']).next() == Some(name);
+    let owners: Vec<&str> =
+        kinds.iter().filter(|k| k.config_doc.iter().any(|doc| top(doc.key))).map(|k| k.name).collect();
+    let [open, close] = brackets;
+    (!owners.is_empty()).then(|| {
+        format!(
+            "{open}service.{name}{close} is a table of {} and belongs to the last [[service]] before it: move it up, \
+             before the next [[service]]",
+            owners.join(", ")
+        )
+    })
 }
 
 /// What `explain` says about a key, in one line.

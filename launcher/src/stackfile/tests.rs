@@ -288,6 +288,10 @@ fn keys() {
         ("unknown key, near one of the launcher", one("hang_timeot = \"1s\"")),
         ("two unknown keys in one table", one("cicle = \"1ms\"\nplcs = \"x\"")),
         ("unknown key in an inner table", one("in = [{ byte = 0 }, { byte = 1, symbl = \"x\" }]")),
+        (
+            "table below the wrong service",
+            format!("{}[[service.cycle]]\nx = 1\n", stack("")),
+        ),
         ("unknown key of the launcher's table", one("restart = { maxx = 3 }")),
         (
             "unknown key in [stack]",
@@ -301,6 +305,9 @@ fn keys() {
         ("bad duration", one("cycle = \"10\"")),
         ("duration without a unit", one("cycle = 10")),
         ("unknown value", stack("").replace("bitrate = \"500k\"", "bitrate = \"500k\"\nmode = \"clasic\"")),
+        ("name of a host", one("").replace("\"500k\"", "\"500k\"\nlisten = \"meter.local:502\"")),
+        ("no port", one("").replace("\"500k\"", "\"500k\"\nlisten = \"10.0.0.1\"")),
+        ("no address", one("").replace("\"500k\"", "\"500k\"\nlisten = \"COM1\"")),
         ("number out of range", one("in = [{ byte = -1 }]")),
         ("not a number", one("in = [{ byte = inf }]")),
         (
@@ -324,6 +331,9 @@ fn names_and_kinds() {
             "[stack]\ndescription = \"x\"\n[[service]]\nname = \"p\"\nkind = \"plc\"".to_owned(),
         ),
         ("[service] with one bracket", "[stack]\nname = \"demo\"\n[service]\nname = \"plc\"\n".to_owned()),
+        ("[service] first", stack("").replacen("[[service]]", "[service] # the bus", 1)),
+        ("text without quotes", stack("").replacen("\"500k\"", "slow", 1)),
+        ("text without quotes, with signs", stack("").replacen("\"500k\"", "/dev/ttyUSB0 # the bus", 1)),
         ("service without name and kind", format!("{}[[service]]\nbitrate = \"1M\"\n", stack(""))),
         ("bad name", stack("").replace("name = \"io\"", "name = \"I O\"")),
         ("name of the rail", stack("").replace("name = \"io\"", "name = \"stack\"")),
@@ -385,6 +395,7 @@ fn conflicts() {
             "symbol twice",
             stack("in = [{ byte = 0, symbol = \"Speed\" }]\nout = [{ byte = 0, symbol = \"SPEED\" }]"),
         ),
+        ("symbols that are no names", stack("in = [{ byte = 0, symbol = \"IF\" }, { byte = 1, symbol = \"volt raw\" }]")),
         ("port twice", listening("127.0.0.1:502", "127.0.0.1:502")),
         ("port of all addresses", listening("0.0.0.0:502", "127.0.0.1:502")),
         ("missing file", bus("file = \"capture.log\"")),

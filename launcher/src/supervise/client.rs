@@ -18,6 +18,8 @@ const REPLY_BYTES_MAX: u64 = 16 * 1024 * 1024;
 pub enum ClientError {
     #[error("no stack is running; `dinrail up STACK.toml` or `dinrail demo` starts one")]
     NoneRunning,
+    #[error("no stack '{0}' is running, nor any other; `dinrail up STACK.toml` or `dinrail demo` starts one")]
+    NotThisNorAny(String),
     #[error("no stack '{asked}' is running; running: {running}")]
     NotRunning { asked: String, running: String },
     #[error("several stacks are running: {0}; say which one with --stack NAME")]
@@ -36,7 +38,7 @@ pub fn find(name: Option<&str>) -> Result<RunningStack, ClientError> {
 fn choose(mut running: Vec<RunningStack>, name: Option<&str>) -> Result<RunningStack, ClientError> {
     let names = |list: &[RunningStack]| list.iter().map(|s| s.stack.as_str()).collect::<Vec<_>>().join(", ");
     if running.is_empty() {
-        return Err(ClientError::NoneRunning);
+        return Err(name.map_or(ClientError::NoneRunning, |n| ClientError::NotThisNorAny(n.to_owned())));
     }
     match name {
         Some(name) => match running.iter().position(|s| s.stack == name) {
@@ -158,6 +160,11 @@ mod tests {
         assert_eq!(choose(vec![stack("a"), stack("b")], Some("b")).unwrap().stack, "b");
         for (running, name, message) in [
             (vec![], None, "no stack is running; `dinrail up STACK.toml` or `dinrail demo` starts one"),
+            (
+                vec![],
+                Some("x"),
+                "no stack 'x' is running, nor any other; `dinrail up STACK.toml` or `dinrail demo` starts one",
+            ),
             (
                 vec![stack("a"), stack("b")],
                 None,

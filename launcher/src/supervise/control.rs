@@ -5,6 +5,7 @@
 use super::logbook::Line;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::fs::File;
 use std::io::{self, Read, Write};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::{UnixListener, UnixStream};
@@ -56,6 +57,12 @@ pub struct ServiceRow {
     /// Of one CPU, over the last second.
     pub cpu_percent: f64,
     pub rss_bytes: u64,
+    /// Unplanned deaths since it was last healthy, that is, ready for a minute.
+    #[serde(default)]
+    pub deaths: u32,
+    /// It dies again and again, too seldom to be held for it.
+    #[serde(default)]
+    pub unstable: bool,
 }
 
 /// The stack as a whole.
@@ -70,6 +77,9 @@ pub struct StackStatus {
     pub services: u32,
     pub ready: u32,
     pub held: Vec<String>,
+    /// Services that die again and again, too seldom to be held for it.
+    #[serde(default)]
+    pub unstable: Vec<String>,
     pub failed: Option<String>,
 }
 
@@ -123,18 +133,39 @@ pub enum Heard {
     Gone,
 }
 
+/// New clients taken in one turn.
+const ACCEPT_MAX: usize = 64;
+
+/// What came of taking new clients.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct Accepted {
+    pub ids: Vec<u64>,
+    /// Clients that were turned away because the process has no descriptor left.
+    pub turned_away: u32,
+    /// Why nobody could be taken, not even to be turned away: the socket stays readable, so it must not be waited for
+    /// until a little later.
+    pub stuck: Option<String>,
+}
+
 /// The listening end.
 pub struct ControlServer {
     listener: UnixListener,
     clients: BTreeMap<u64, Client>,
     next: u64,
+    /// Let go of for a moment when there is no descriptor left, so that a client can be told.
+    spare: Option<File>,
+}
+
+/// Neither this process nor the system has a descriptor left.
+fn no_descriptor(error: &io::Error) -> bool {
+    matches!(error.raw_os_error(), Some(libc::EMFILE | libc::ENFILE))
 }
 
 impl ControlServer {
     pub fn open(path: &Path) -> io::Result<Self> {
         let listener = UnixListener::bind(path)?;
         listener.set_nonblocking(true)?;
-        Ok(Self { listener, clients: BTreeMap::new(), next: 0 })
+        Ok(Self { listener, clients: BTreeMap::new(), next: 0, spare: File::open("/dev/null").ok() })
     }
 
     pub fn fd(&self) -> BorrowedFd<'_> {
@@ -146,9 +177,35 @@ impl ControlServer {
     }
 
     /// Takes new clients; those above the limit are told and closed.
-    pub fn accept(&mut self) -> Vec<u64> {
-        let mut new = Vec::new();
-        while let Ok((mut stream, _)) = self.listener.accept() {
+    pub fn accept(&mut self) -> Accepted {
+        let mut accepted = Accepted::default();
+        for _ in 0..ACCEPT_MAX {
+            let mut stream = match self.listener.accept() {
+                Ok((stream, _)) => stream,
+                Err(e) if e.kind() == io::ErrorKind::WouldBlock => break,
+                // It was gone before it was taken.
+                Err(e)
+                    if matches!(e.kind(), io::ErrorKind::Interrupted | io::ErrorKind::ConnectionAborted) =>
+                {
+                    continue;
+                }
+                Err(e) if no_descriptor(&e) => match self.turn_away() {
+                    Ok(()) => {
+                        accepted.turned_away += 1;
+                        continue;
+                    }
+                    // The system looks for a descriptor before it looks for a client.
+                    Err(e) if e.kind() == io::ErrorKind::WouldBlock => break,
+                    Err(e) => {
+                        accepted.stuck = Some(e.to_string());
+                        break;
+                    }
+                },
+                Err(e) => {
+                    accepted.stuck = Some(e.to_string());
+                    break;
+                }
+            };
             if stream.set_nonblocking(true).is_err() {
                 continue;
             }
@@ -161,9 +218,21 @@ impl ControlServer {
                 self.next,
                 Client { stream, input: Vec::new(), output: Vec::new(), follows: Follows::None },
             );
-            new.push(self.next);
+            accepted.ids.push(self.next);
         }
-        new
+        accepted
+    }
+
+    /// Tells one client that there is no descriptor for it, with the spare one.
+    fn turn_away(&mut self) -> io::Result<()> {
+        drop(self.spare.take());
+        let told = self.listener.accept().map(|(mut stream, _)| {
+            let _ = stream.set_nonblocking(true);
+            let _ =
+                stream.write_all(b"{\"error\":\"the launcher has no file descriptor left (ulimit -n)\"}\n");
+        });
+        self.spare = File::open("/dev/null").ok();
+        told
     }
 
     /// Reads what a client sent.
@@ -264,7 +333,7 @@ mod tests {
     #[test]
     fn requests_come_in_pieces_and_answers_go_out() {
         let (mut server, mut client, path) = pair("pieces");
-        let ids = server.accept();
+        let ids = server.accept().ids;
         client.write_all(b"{\"do\":\"ps\"}\n{\"do\":\"fly\"}\n{\"do\":\"rest").unwrap();
         let Heard::Requests(heard) = server.hear(ids[0]) else { panic!("gone") };
         assert_eq!(heard[0], Ok(Request::Ps {}));
@@ -287,7 +356,7 @@ mod tests {
     #[test]
     fn a_client_that_never_ends_its_line_or_never_reads_is_dropped() {
         let (mut server, mut client, path) = pair("flood");
-        let id = server.accept()[0];
+        let id = server.accept().ids[0];
         client.set_nonblocking(true).unwrap();
         let mut gone = false;
         for _ in 0..100 {
@@ -304,7 +373,7 @@ mod tests {
     fn the_seventeenth_client_is_told() {
         let (mut server, first, path) = pair("crowd");
         let more: Vec<_> = (0..CLIENTS_MAX).map(|_| UnixStream::connect(&path).unwrap()).collect();
-        assert_eq!(server.accept().len(), CLIENTS_MAX);
+        assert_eq!(server.accept().ids.len(), CLIENTS_MAX);
         let mut line = String::new();
         BufReader::new(more.last().unwrap()).read_line(&mut line).unwrap();
         assert!(line.contains("16 clients"));

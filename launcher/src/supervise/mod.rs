@@ -45,14 +45,14 @@ use ipc_types::clock;
 use ipc_types::reactor::signals;
 use rail_thread::{RailHandle, Report};
 use state_dir::{LockError, RunningStack, StackLock};
-use std::io;
+use std::io::{self, Write as _};
 use std::net::TcpListener;
 use std::os::fd::OwnedFd;
 use std::time::Duration;
 use supervisor::Supervisor;
 
 /// Making every topic of a stack takes milliseconds; so long means that the middleware hangs.
-const RAIL_START_LIMIT: Duration = Duration::from_secs(10);
+const RAIL_START_LIMIT: Duration = Duration::from_secs(30);
 
 /// How to run a stack.
 #[derive(Debug, Clone, Default)]
@@ -116,6 +116,7 @@ fn system(what: &'static str) -> impl Fn(io::Error) -> UpError {
 pub fn run(loaded: Loaded, options: &Options) -> Result<Outcome, UpError> {
     let Loaded { stack, launch, settings, .. } = loaded;
     sys::keep_descriptors_private();
+    sys::hear_of_children();
     let executable = Executable::own().map_err(system("opening its own executable"))?;
     let stop_signals = supervisor::stop_signals();
     let signal_fd = signals::descriptor(&stop_signals).map_err(system("signals"))?;
@@ -175,7 +176,8 @@ struct Wipe {
 impl Drop for Wipe {
     fn drop(&mut self) {
         if let Err(e) = ground::wipe(&self.root, &self.prefix) {
-            eprintln!("dinrail: {e}");
+            // Not `eprintln!`: it panics when nobody reads any more.
+            let _ = writeln!(io::stderr(), "dinrail: {e}");
         }
     }
 }

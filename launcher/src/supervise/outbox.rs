@@ -1,17 +1,19 @@
-//! Events that wait until every recorder hears them, so that the start of the stack and a recorder's own death are in
-//! the recording. Their stamps are those of when they happened. Sans-I/O.
+//! Events, and what recorders missed of them. Everybody else must hear at once who died (the PLC marks its inputs by
+//! it), so an event goes out the moment it happens. What happens while a recorder starts or is down is kept as well and
+//! said again when it listens, so that the start of the stack and the recorder's own death are in the recording; the
+//! stamps are those of when it happened. Sans-I/O.
 
 use super::rail_thread::Beat;
 use ipc_types::Stack;
-use ipc_types::event::{EventBody, EventKind};
+use ipc_types::event::{EventBody, EventKind, Level};
 use ipc_types::payload::HealthState;
-use serde_json::Value;
+use serde_json::{Value, json};
 use std::collections::VecDeque;
 
-/// Events that may wait.
-const WAITING_MAX: usize = 256;
-/// How long they wait at most, in ns.
-const WAITING_LIMIT_NS: u64 = 10_000_000_000;
+/// Events that are kept for recorders; the oldest go first.
+const KEPT_MAX: usize = 256;
+/// Most events said again at once: a reader's queue holds four times as many.
+const AGAIN_MAX: usize = 64;
 
 /// A recorder, as far as events are concerned.
 #[derive(Debug)]
@@ -21,15 +23,14 @@ struct Listening {
     /// Its generation from which on it counts.
     from: u32,
     ready: bool,
-    /// It is down until somebody starts it again: nothing waits for it.
-    held: bool,
 }
 
-/// Events on their way to the rail.
+/// What recorders missed.
 #[derive(Debug)]
 pub struct Outbox {
     recorders: Vec<Listening>,
-    waiting: VecDeque<EventBody>,
+    kept: VecDeque<EventBody>,
+    forgotten: u64,
 }
 
 impl Outbox {
@@ -39,60 +40,61 @@ impl Outbox {
     }
 
     fn with(recorders: impl Iterator<Item = (usize, String)>) -> Self {
-        let recorders = recorders
-            .map(|(service, name)| Listening { service, name, from: 1, ready: false, held: false })
-            .collect();
-        Self { recorders, waiting: VecDeque::new() }
+        let recorders =
+            recorders.map(|(service, name)| Listening { service, name, from: 1, ready: false }).collect();
+        Self { recorders, kept: VecDeque::new(), forgotten: 0 }
     }
 
-    /// Takes an event; [`Self::due`] says when it may go.
-    pub fn take(&mut self, body: EventBody) {
-        if let Some(recorder) = self.recorders.iter_mut().find(|r| r.name == body.service) {
-            match body.event {
-                EventKind::Died => {
-                    let generation = body.detail.get("generation").and_then(Value::as_u64).unwrap_or(0);
-                    recorder.from = generation as u32 + 1;
-                    recorder.ready = false;
-                }
-                EventKind::Held => recorder.held = true,
-                EventKind::Started => recorder.held = false,
-                _ => {}
-            }
+    /// An event that goes out now: kept when a recorder does not hear it.
+    pub fn note(&mut self, body: &EventBody) {
+        if body.event == EventKind::Died
+            && let Some(recorder) = self.recorders.iter_mut().find(|r| r.name == body.service)
+        {
+            let generation = body.detail.get("generation").and_then(Value::as_u64).unwrap_or(0);
+            recorder.from = generation as u32 + 1;
+            recorder.ready = false;
         }
-        self.waiting.push_back(body);
+        if self.recorders.iter().all(|r| r.ready) {
+            return;
+        }
+        if self.kept.len() == KEPT_MAX {
+            self.kept.pop_front();
+            self.forgotten += 1;
+        }
+        self.kept.push_back(body.clone());
     }
 
-    /// What may be published now, in order: all when every recorder is ready, else what waited for too long or is
-    /// too much.
-    pub fn due(&mut self, beats: &[Beat], now: u64) -> Vec<EventBody> {
+    /// What is to be said again now, in order, once every recorder listens; ask again until it is empty.
+    pub fn again(&mut self, beats: &[Beat]) -> Vec<EventBody> {
         for beat in beats.iter().filter(|b| matches!(b.state, HealthState::Ready | HealthState::Degraded)) {
             for recorder in self.recorders.iter_mut().filter(|r| r.service == beat.service) {
                 recorder.ready |= beat.generation >= recorder.from;
             }
         }
-        if self.recorders.iter().all(|r| r.ready || r.held) {
-            return self.rest();
+        if self.kept.is_empty() || !self.recorders.iter().all(|r| r.ready) {
+            return Vec::new();
         }
-        let too_long =
-            self.waiting.iter().take_while(|b| now.saturating_sub(b.t_ns) > WAITING_LIMIT_NS).count();
-        let count = too_long.max(self.waiting.len().saturating_sub(WAITING_MAX));
-        self.waiting.drain(..count).collect()
-    }
-
-    /// All that waits.
-    pub fn rest(&mut self) -> Vec<EventBody> {
-        self.waiting.drain(..).collect()
+        let count = self.kept.len().min(AGAIN_MAX);
+        let mut bodies: Vec<EventBody> = self.kept.drain(..count).collect();
+        if self.forgotten > 0 && self.kept.is_empty() {
+            let forgotten = std::mem::take(&mut self.forgotten);
+            let message = format!(
+                "{forgotten} events of the time in which no recorder listened are not in the recording"
+            );
+            let name = self.recorders.first().map_or("", |r| r.name.as_str());
+            let detail = json!({ "events": forgotten });
+            bodies.push(EventBody::now(EventKind::RecorderFault, Level::Warning, name, message, detail));
+        }
+        bodies
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ipc_types::event::Level;
 
-    fn event(service: &str, kind: EventKind, generation: u32, t_ns: u64) -> EventBody {
-        let detail = serde_json::json!({ "generation": generation });
-        EventBody { t_ns, ..EventBody::now(kind, Level::Info, service, "", detail) }
+    fn event(service: &str, kind: EventKind, generation: u32) -> EventBody {
+        EventBody::now(kind, Level::Info, service, "", json!({ "generation": generation }))
     }
 
     fn beat(service: usize, generation: u32, state: HealthState) -> Beat {
@@ -106,52 +108,54 @@ mod tests {
     #[test]
     fn a_recorder_hears_of_its_own_death() {
         let mut outbox = Outbox::with([(1, "rec".to_owned())].into_iter());
-        outbox.take(event("plc", EventKind::Started, 1, 0));
-        assert!(
-            outbox.due(&[beat(1, 1, HealthState::Starting), beat(0, 1, HealthState::Ready)], 0).is_empty()
-        );
-        assert_eq!(kinds(&outbox.due(&[beat(1, 1, HealthState::Ready)], 0)), [EventKind::Started]);
-        outbox.take(event("plc", EventKind::Died, 1, 0));
-        assert_eq!(kinds(&outbox.due(&[], 0)), [EventKind::Died], "another's death does not wait");
-        outbox.take(event("rec", EventKind::Died, 1, 0));
-        outbox.take(event("rec", EventKind::Started, 2, 0));
-        assert!(outbox.due(&[beat(1, 1, HealthState::Ready)], 0).is_empty(), "a heartbeat from before");
-        let heard = outbox.due(&[beat(1, 2, HealthState::Ready)], 0);
+        outbox.note(&event("plc", EventKind::Started, 1));
+        let early = [beat(1, 1, HealthState::Starting), beat(0, 1, HealthState::Ready)];
+        assert!(outbox.again(&early).is_empty());
+        assert_eq!(kinds(&outbox.again(&[beat(1, 1, HealthState::Ready)])), [EventKind::Started]);
+        outbox.note(&event("plc", EventKind::Died, 1));
+        assert!(outbox.again(&[]).is_empty(), "it heard that");
+        let died = event("rec", EventKind::Died, 1);
+        outbox.note(&died);
+        outbox.note(&event("rec", EventKind::Started, 2));
+        assert!(outbox.again(&[beat(1, 1, HealthState::Ready)]).is_empty(), "a heartbeat from before");
+        let heard = outbox.again(&[beat(1, 2, HealthState::Ready)]);
         assert_eq!(kinds(&heard), [EventKind::Died, EventKind::Started]);
+        assert_eq!((heard[0].t_ns, heard[0].utc_ns), (died.t_ns, died.utc_ns), "stamped when it happened");
+        assert!(outbox.again(&[beat(1, 2, HealthState::Ready)]).is_empty(), "once");
     }
 
     #[test]
-    fn events_wait_neither_for_ever_nor_without_bound() {
+    fn a_recorder_that_stays_away_costs_bounded_memory_and_its_successor_is_told() {
         let mut outbox = Outbox::with([(0, "rec".to_owned())].into_iter());
-        outbox.take(event("a", EventKind::Started, 1, 0));
-        outbox.take(event("b", EventKind::Ready, 1, 5));
-        assert_eq!(kinds(&outbox.due(&[], WAITING_LIMIT_NS + 5)), [EventKind::Started]);
-        for _ in 0..WAITING_MAX {
-            outbox.take(event("c", EventKind::Died, 1, 5));
+        outbox.note(&event("a", EventKind::Started, 1));
+        outbox.note(&event("b", EventKind::Ready, 1));
+        for _ in 1..KEPT_MAX {
+            outbox.note(&event("c", EventKind::Died, 1));
         }
-        assert_eq!(kinds(&outbox.due(&[], 5)), [EventKind::Ready]);
-        assert_eq!(outbox.rest().len(), WAITING_MAX);
+        let mut told = outbox.again(&[beat(0, 7, HealthState::Ready)]);
+        assert_eq!((told.len(), told[0].event), (AGAIN_MAX, EventKind::Ready));
+        (1..KEPT_MAX / AGAIN_MAX).for_each(|_| told.extend(outbox.again(&[])));
+        assert!(told.len() == KEPT_MAX + 1 && outbox.again(&[]).is_empty());
+        let last = told.last().unwrap();
+        assert_eq!((last.event, last.service.as_str()), (EventKind::RecorderFault, "rec"));
+        assert!(last.message.starts_with("1 events"), "{}", last.message);
     }
 
     #[test]
-    fn a_recorder_that_is_held_delays_nobody() {
-        let mut outbox = Outbox::with([(0, "rec".to_owned())].into_iter());
-        assert!(outbox.due(&[beat(0, 1, HealthState::Ready)], 0).is_empty());
-        outbox.take(event("rec", EventKind::Died, 1, 0));
-        outbox.take(event("rec", EventKind::Held, 1, 0));
-        assert_eq!(kinds(&outbox.due(&[], 0)), [EventKind::Died, EventKind::Held]);
-        outbox.take(event("plc", EventKind::Died, 1, 0));
-        assert_eq!(kinds(&outbox.due(&[], 0)), [EventKind::Died]);
-        // Started by hand, it is waited for again.
-        outbox.take(event("rec", EventKind::Started, 2, 0));
-        assert!(outbox.due(&[], 0).is_empty());
-        assert_eq!(kinds(&outbox.due(&[beat(0, 2, HealthState::Ready)], 0)), [EventKind::Started]);
+    fn all_recorders_must_listen() {
+        let mut outbox = Outbox::with([(0, "rec".to_owned()), (1, "long".to_owned())].into_iter());
+        assert!(outbox.again(&[beat(0, 1, HealthState::Ready), beat(1, 1, HealthState::Ready)]).is_empty());
+        outbox.note(&event("long", EventKind::Died, 1));
+        outbox.note(&event("plc", EventKind::Died, 1));
+        assert!(outbox.again(&[beat(0, 1, HealthState::Ready)]).is_empty());
+        let told = outbox.again(&[beat(1, 2, HealthState::Degraded)]);
+        assert_eq!(kinds(&told), [EventKind::Died, EventKind::Died]);
     }
 
     #[test]
-    fn without_a_recorder_nothing_waits() {
+    fn without_a_recorder_nothing_is_kept() {
         let mut outbox = Outbox::with(std::iter::empty());
-        outbox.take(event("a", EventKind::Started, 1, 0));
-        assert_eq!(outbox.due(&[], 0).len(), 1);
+        outbox.note(&event("a", EventKind::Started, 1));
+        assert!(outbox.kept.is_empty() && outbox.again(&[]).is_empty());
     }
 }

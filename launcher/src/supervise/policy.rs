@@ -12,14 +12,14 @@
 //! Stopping -> Ended                                  in reverse order, recorders last
 //! ```
 
+mod ending;
 mod model;
 
-pub use model::{Action, Death, Exhausted, Kill, Notice, Phase, Rule, Slot};
+pub use model::{Action, Death, Exhausted, HEALTHY_NS, Kill, Notice, Phase, Rule, Slot, UNSTABLE_AFTER};
 
 use ipc_types::event::{EventKind, Level};
 use ipc_types::payload::HealthState;
 use serde_json::{Value, json};
-use std::collections::VecDeque;
 
 /// Between SIGABRT, which leaves a core and a backtrace, and SIGKILL.
 pub const ABORT_GRACE_NS: u64 = 500_000_000;
@@ -31,11 +31,17 @@ pub const CLEAN_PAUSE_NS: u64 = 250_000_000;
 /// Heartbeats are read every 20 ms. What passes beyond this between two readings is time in which the machine stood
 /// still (frozen, stopped, paused as a virtual machine), or the reader: it counts as nobody's silence.
 pub const READ_PAUSE_NS: u64 = 100_000_000;
+/// A process that has not ended so long after SIGKILL waits inside the kernel (a driver, a dead network disk): it is
+/// told, and the end of the stack does not wait for it any longer.
+pub const UNKILLABLE_NS: u64 = 5_000_000_000;
+/// A second wish to stop within this time is the first one, delivered twice: a closing terminal and `timeout` send their
+/// signal to the process and to its group.
+pub const STOP_AGAIN_NS: u64 = 500_000_000;
 /// Pause between two clean-ups while /dev/shm is full.
 const NO_ROOM_PAUSE_NS: u64 = 500_000_000;
 /// How long the other services wait for the recorders at the start of a stack. A recorder is ready after some
-/// 20 ms; one that is not must not keep a plant from running.
-pub const RECORDER_HEAD_START_NS: u64 = 500_000_000;
+/// 20 ms, on a slow machine with much to do after 1 s (measured); one that is not must not keep a plant from running.
+pub const RECORDER_HEAD_START_NS: u64 = 3_000_000_000;
 
 /// The supervision of one stack.
 #[derive(Debug)]
@@ -43,6 +49,7 @@ pub struct Policy {
     slots: Vec<Slot>,
     order: Vec<usize>,
     stopping: bool,
+    stop_at: u64,
     failed: Option<String>,
     ended: bool,
     clean_running: bool,
@@ -61,25 +68,13 @@ pub struct Policy {
 impl Policy {
     /// Services in the order of the stack file; `term_grace_ns` passes between SIGTERM and SIGKILL.
     pub fn new(services: Vec<(String, Rule)>, term_grace_ns: u64) -> Self {
-        let slots: Vec<Slot> = services
-            .into_iter()
-            .map(|(name, rule)| Slot {
-                name,
-                rule,
-                phase: Phase::Idle,
-                generation: 0,
-                since: 0,
-                ready_at: 0,
-                silent_from: 0,
-                recent: VecDeque::new(),
-                row: 0,
-            })
-            .collect();
+        let slots: Vec<Slot> = services.into_iter().map(|(name, rule)| Slot::new(name, rule)).collect();
         let (recorders, others): (Vec<_>, Vec<_>) = (0..slots.len()).partition(|&i| slots[i].rule.recorder);
         Self {
             slots,
             order: recorders.into_iter().chain(others).collect(),
             stopping: false,
+            stop_at: 0,
             failed: None,
             ended: false,
             clean_running: false,
@@ -195,6 +190,25 @@ impl Policy {
                 json!({ "generation": generation, "after_ms": after_ms }),
             );
             self.recorders_are_up(now);
+        } else if self.slots[service].is_healthy(now) {
+            self.recovered(service);
+        }
+    }
+
+    /// It has been ready for a while: whatever was before is over.
+    fn recovered(&mut self, service: usize) {
+        let slot = &mut self.slots[service];
+        let (deaths, was_unstable) = (slot.deaths(), slot.unstable());
+        slot.forgive();
+        if was_unstable {
+            let for_s = HEALTHY_NS.max(slot.rule.within_ns) / 1_000_000_000;
+            self.tell(
+                Some(service),
+                EventKind::Unstable,
+                Level::Info,
+                format!("healthy again: ready for {for_s} s after {deaths} deaths"),
+                json!({ "deaths": deaths, "healthy": true }),
+            );
         }
     }
 
@@ -237,7 +251,7 @@ impl Policy {
         let ran_ms = now.saturating_sub(slot.since) / 1_000_000;
         if self.stopping {
             slot.phase = Phase::Ended;
-            if !matches!(phase, Phase::Stopping { .. }) {
+            if !matches!(phase, Phase::Stopping { .. } | Phase::Leaving { .. } | Phase::Ended) {
                 self.tell_death(service, death, ran_ms);
             }
             self.stop_next(now);
@@ -245,11 +259,11 @@ impl Policy {
         }
         let planned = matches!(phase, Phase::Restarting { .. });
         if !planned {
-            if phase == Phase::Running && now.saturating_sub(slot.ready_at) >= slot.rule.within_ns {
-                slot.row = 0;
-                slot.recent.clear();
+            if slot.is_healthy(now) {
+                slot.forgive();
             }
-            slot.row += 1;
+            slot.row = slot.row.saturating_add(1);
+            slot.unready = if slot.ready_at > 0 { 0 } else { slot.unready.saturating_add(1) };
             self.tell_death(service, death, ran_ms);
         }
         let round = self.request_clean();
@@ -324,6 +338,10 @@ impl Policy {
             return;
         }
         if let Err(cause) = result {
+            if !self.slots.iter().any(|slot| matches!(slot.phase, Phase::Cleaning { .. })) {
+                // Only tools had left something: the stack lives without that clean-up, and tries again later.
+                return;
+            }
             self.clean_failures += 1;
             if self.clean_failures >= CLEAN_ATTEMPTS {
                 self.fail(
@@ -367,7 +385,7 @@ impl Policy {
         while slot.recent.front().is_some_and(|&t| now.saturating_sub(t) > rule.within_ns) {
             slot.recent.pop_front();
         }
-        if slot.recent.len() >= rule.max as usize {
+        if slot.recent.len() >= rule.max as usize || slot.unready > rule.max {
             self.exhausted(service, now);
             return;
         }
@@ -393,9 +411,32 @@ impl Policy {
             message,
             json!({ "delay_ms": delay_ms, "generation": next }),
         );
+        self.tell_unstable(service);
         if delay == 0 {
             self.spawn(service, now);
         }
+    }
+
+    /// Loud, but ever more seldom: at the fifth death since it was healthy, the tenth, the twentieth.
+    fn tell_unstable(&mut self, service: usize) {
+        let slot = &self.slots[service];
+        let (deaths, name) = (slot.deaths(), &slot.name);
+        if deaths % UNSTABLE_AFTER != 0 || !(deaths / UNSTABLE_AFTER).is_power_of_two() {
+            return;
+        }
+        let healthy_s = HEALTHY_NS.max(slot.rule.within_ns) / 1_000_000_000;
+        let message = format!(
+            "unstable: died {deaths} times and was never ready for {healthy_s} s in between; `dinrail logs {name}` says \
+             why. It is started again all the same, up to {} ms after each death",
+            slot.rule.backoff_max_ns / 1_000_000
+        );
+        self.tell(
+            Some(service),
+            EventKind::Unstable,
+            Level::Fault,
+            message,
+            json!({ "deaths": deaths, "healthy": false }),
+        );
     }
 
     fn exhausted(&mut self, service: usize, now: u64) {
@@ -404,6 +445,12 @@ impl Policy {
         let within_s = slot.rule.within_ns as f64 / 1e9;
         let budget = match slot.rule.max {
             0 => "it ended, and `restart = { max = 0 }` allows no restart".to_owned(),
+            max if slot.recent.len() < max as usize => {
+                format!(
+                    "it did not get ready in {} starts in a row, which is the budget of {max} restarts",
+                    slot.unready
+                )
+            }
             max => format!("the budget of {max} restarts in {within_s} s is used up"),
         };
         let (name, on_exhausted) = (slot.name.clone(), slot.rule.on_exhausted);
@@ -427,6 +474,7 @@ impl Policy {
         let next = slot.generation + 1;
         match slot.phase {
             Phase::Starting | Phase::Running => {
+                slot.forgive();
                 slot.phase = Phase::Restarting { kill_at: now + grace };
                 let name = slot.name.clone();
                 self.tell(
@@ -439,8 +487,7 @@ impl Policy {
                 self.out.push(Action::Signal { service, signal: Kill::Term });
             }
             Phase::Waiting { .. } | Phase::Held => {
-                slot.row = 0;
-                slot.recent.clear();
+                slot.forgive();
                 self.spawn(service, now);
             }
             _ => return Err(format!("service '{}' is {} already", slot.name, slot.phase.word())),
@@ -457,15 +504,24 @@ impl Policy {
         for service in 0..self.slots.len() {
             match self.slots[service].phase {
                 Phase::Aborting { kill_at } if now >= kill_at => {
-                    self.slots[service].phase = Phase::Killed;
+                    self.slots[service].phase = Phase::Killed { overdue_at: now + UNKILLABLE_NS };
                     self.out.push(Action::Signal { service, signal: Kill::Now });
+                }
+                Phase::Killed { overdue_at } if now >= overdue_at => {
+                    self.slots[service].phase = Phase::Killed { overdue_at: u64::MAX };
+                    self.tell_unkillable(service, "it is started again when it has ended");
                 }
                 Phase::Restarting { kill_at } if now >= kill_at => {
                     self.slots[service].phase = Phase::Restarting { kill_at: u64::MAX };
                     self.out.push(Action::Signal { service, signal: Kill::Now });
                 }
+                Phase::Leaving { until } if now >= until => {
+                    self.slots[service].phase = Phase::Ended;
+                    self.tell_unkillable(service, "the stack ends without it");
+                    self.stop_next(now);
+                }
                 Phase::Stopping { kill_at } if now >= kill_at => {
-                    self.slots[service].phase = Phase::Stopping { kill_at: u64::MAX };
+                    self.slots[service].phase = Phase::Leaving { until: now + UNKILLABLE_NS };
                     let message = format!(
                         "did not end within {} ms of SIGTERM: killed",
                         self.term_grace_ns / 1_000_000
@@ -485,65 +541,12 @@ impl Policy {
             Phase::Aborting { kill_at } | Phase::Restarting { kill_at } | Phase::Stopping { kill_at } => {
                 Some(kill_at)
             }
+            Phase::Killed { overdue_at: at } | Phase::Leaving { until: at } => Some(at),
             // At the end nothing is started any more: a deadline that nobody meets would wake for ever.
             Phase::Waiting { until } if !self.stopping => Some(until),
             _ => None,
         };
         let retry = self.clean_retry_at.filter(|_| !self.stopping);
         self.slots.iter().filter_map(due).filter(|&t| t != u64::MAX).chain(retry).min()
-    }
-
-    /// Ends the stack: one service after the other, in reverse order. Asked a second time, kills what is left.
-    pub fn stop(&mut self, why: &str, now: u64) {
-        if self.stopping {
-            for service in 0..self.slots.len() {
-                if self.slots[service].phase.alive() {
-                    self.slots[service].phase = Phase::Stopping { kill_at: u64::MAX };
-                    self.out.push(Action::Signal { service, signal: Kill::Now });
-                }
-            }
-            return;
-        }
-        self.tell(None, EventKind::Stopping, Level::Info, format!("stopping: {why}"), Value::Null);
-        self.begin_stop(now);
-    }
-
-    /// Ends the stack as failed: exit code 1.
-    pub fn fail(&mut self, why: String, now: u64) {
-        if self.failed.is_none() {
-            self.tell(None, EventKind::StackFailed, Level::Fault, why.clone(), Value::Null);
-            self.failed = Some(why);
-        }
-        if !self.stopping {
-            self.begin_stop(now);
-        }
-    }
-
-    fn begin_stop(&mut self, now: u64) {
-        self.stopping = true;
-        self.stop_next(now);
-    }
-
-    fn stop_next(&mut self, now: u64) {
-        let grace = self.term_grace_ns;
-        for service in self.order.clone().into_iter().rev() {
-            let slot = &mut self.slots[service];
-            match slot.phase {
-                Phase::Ended => {}
-                Phase::Stopping { .. } => return,
-                phase if phase.alive() => {
-                    slot.phase = Phase::Stopping { kill_at: now + grace };
-                    self.out.push(Action::Signal { service, signal: Kill::Term });
-                    return;
-                }
-                // A held one stays visible as held: the stack did not end healthy.
-                Phase::Held => {}
-                _ => slot.phase = Phase::Ended,
-            }
-        }
-        if !self.ended {
-            self.ended = true;
-            self.out.push(Action::Ended);
-        }
     }
 }

@@ -7,10 +7,11 @@ use super::outbox::Outbox;
 use super::watch::{Observed, Observer};
 use ipc_types::context::Context;
 use ipc_types::event::{EventBody, EventKind, Level};
-use ipc_types::payload::{Event, Health, HealthState};
+use ipc_types::payload::{Event, Health, HealthState, event_flag};
 use ipc_types::port::{Publisher, Subscriber};
 use ipc_types::rail::{self, Held, RailError};
 use ipc_types::reactor::Reactor;
+use ipc_types::reserve::reserve;
 use ipc_types::topic::{EVENTS, TopicKind};
 use ipc_types::{Stack, clock};
 use rustix::event::{EventfdFlags, eventfd};
@@ -18,10 +19,12 @@ use serde_json::Value;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 /// Heartbeats and orders are looked at so often.
 const TURN: Duration = Duration::from_millis(20);
+/// The memory of the stack's objects is looked after so often.
+const STOCK_NS: u64 = 1_000_000_000;
 /// Orders that may wait.
 const ORDERS_MAX: usize = 1024;
 /// Longest message of an event in bytes.
@@ -154,6 +157,7 @@ fn serve(
         pulses.push(Pulse { health, writer: service.index });
     }
     let mut observer = Observer::new(&ctx, observe)?;
+    let mut stock = Stock::default();
     out.send(Report::Up);
 
     let mut reactor = Reactor::new()?;
@@ -166,10 +170,13 @@ fn serve(
         for order in orders.try_iter() {
             match order {
                 Order::Tell { service, kind, level, message, detail } => {
-                    outbox.take(EventBody::now(kind, level, &service, message, detail));
+                    let body = EventBody::now(kind, level, &service, message, detail);
+                    outbox.note(&body);
+                    if let Some(trouble) = post.send(body, 0) {
+                        out.send(Report::Trouble(trouble));
+                    }
                 }
                 Order::Quit => {
-                    post.send(outbox.rest());
                     // What services said last, the recorder above all.
                     let observed = observer.look(true).map(Box::new);
                     out.send(Report::Turn { t_ns: clock::mono_ns(), beats: Vec::new(), observed });
@@ -187,7 +194,12 @@ fn serve(
                 }
             });
         }
-        if let Some(trouble) = post.send(outbox.due(&beats, clock::mono_ns())) {
+        for body in outbox.again(&beats) {
+            if let Some(trouble) = post.send(body, event_flag::AGAIN) {
+                out.send(Report::Trouble(trouble));
+            }
+        }
+        if let Some(trouble) = stock.take(stack, t_ns) {
             out.send(Report::Trouble(trouble));
         }
         let observed = observer.look(false).map(Box::new);
@@ -195,7 +207,33 @@ fn serve(
     }
 }
 
-/// Publishes what may go now.
+/// Sets aside the memory of tools that joined, and what there was no room for before.
+#[derive(Default)]
+struct Stock {
+    due_ns: u64,
+    /// When something was last made or removed in /dev/shm.
+    changed: Option<SystemTime>,
+    short: bool,
+}
+
+impl Stock {
+    /// Something to say when the memory has become short.
+    fn take(&mut self, stack: &Stack, now_ns: u64) -> Option<String> {
+        let shm = stack.root.parent().filter(|_| now_ns >= self.due_ns)?;
+        self.due_ns = now_ns + STOCK_NS;
+        // One look at the folder instead of one at each object.
+        let changed = shm.metadata().and_then(|m| m.modified()).ok();
+        if !self.short && changed.is_some() && changed == self.changed {
+            return None;
+        }
+        let complaint = reserve(shm, &stack.prefix).ok()?.complaint();
+        self.changed = changed;
+        let before = std::mem::replace(&mut self.short, complaint.is_some());
+        complaint.filter(|_| !before)
+    }
+}
+
+/// Publishes events.
 struct Post {
     events: Publisher<Event>,
     told: bool,
@@ -203,27 +241,70 @@ struct Post {
 
 impl Post {
     /// The first failure is returned as text, the others are silent.
-    fn send(&mut self, bodies: Vec<EventBody>) -> Option<String> {
-        let mut trouble = None;
-        for body in bodies {
-            if let Err(e) = publish(&mut self.events, body)
-                && !std::mem::replace(&mut self.told, true)
-            {
-                trouble = Some(format!("an event could not be published: {e}"));
-            }
-        }
-        trouble
+    fn send(&mut self, body: EventBody, flags: u32) -> Option<String> {
+        let t_ns = body.t_ns;
+        let sent = fit(body, self.events.max_tail() as usize).and_then(|text| {
+            self.events.send_at(Event { flags, ..Event::default() }, &text, t_ns).map_err(|e| e.to_string())
+        });
+        self.events.ring();
+        let first = sent.is_err() && !std::mem::replace(&mut self.told, true);
+        sent.err().filter(|_| first).map(|cause| format!("an event could not be published: {cause}"))
     }
 }
 
-fn publish(events: &mut Publisher<Event>, mut body: EventBody) -> Result<(), String> {
+/// The event as JSON of at most `max` bytes: old log lines go first, then all of the detail.
+fn fit(mut body: EventBody, max: usize) -> Result<Vec<u8>, String> {
     body.message.truncate(body.message.floor_char_boundary(EVENT_MESSAGE_MAX));
-    let mut text = serde_json::to_vec(&body).map_err(|e| e.to_string())?;
-    if text.len() > events.max_tail() as usize {
-        body.detail = serde_json::json!("left out: too long");
-        text = serde_json::to_vec(&body).map_err(|e| e.to_string())?;
+    loop {
+        let text = serde_json::to_vec(&body).map_err(|e| e.to_string())?;
+        let over = text.len().saturating_sub(max);
+        if over == 0 {
+            return Ok(text);
+        }
+        if drop_lines(&mut body.detail, over) {
+            continue;
+        }
+        body.detail = match body.detail {
+            Value::Null => return Err(format!("{} bytes; at most {max} fit", text.len())),
+            Value::String(_) => Value::Null,
+            _ => serde_json::json!("left out: too long"),
+        };
     }
-    events.send_tail(Event::default(), &text).map_err(|e| e.to_string())?;
-    events.ring();
-    Ok(())
+}
+
+/// Drops the oldest log lines of a detail until so many bytes are gone; `false` when there is none.
+fn drop_lines(detail: &mut Value, bytes: usize) -> bool {
+    let Some(lines) = detail.get_mut("log").and_then(Value::as_array_mut) else { return false };
+    let mut freed = 0;
+    let gone = lines.iter().take_while(|line| {
+        let needed = freed < bytes;
+        // With its quotes and comma.
+        freed += line.to_string().len() + 1;
+        needed
+    });
+    let gone = gone.count();
+    lines.drain(..gone);
+    gone > 0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn of_a_long_death_the_last_words_are_kept() {
+        let lines: Vec<String> = (0..20).map(|i| format!("{i} \"{}", "x".repeat(150))).collect();
+        let body = |detail| EventBody::now(EventKind::Died, Level::Fault, "plc", "died", detail);
+        let text = fit(body(json!({ "exit_code": 1, "log": lines })), 2048).unwrap();
+        assert!(text.len() > 1700 && text.len() <= 2048, "{}", text.len());
+        let told: EventBody = serde_json::from_slice(&text).unwrap();
+        let log = told.detail["log"].as_array().unwrap();
+        assert_eq!(log.last().unwrap(), lines.last().unwrap());
+        assert_eq!(told.detail["exit_code"], 1);
+        let long = fit(body(json!({ "text": "x".repeat(4000) })), 2048).unwrap();
+        let told: EventBody = serde_json::from_slice(&long).unwrap();
+        assert_eq!(told.detail, "left out: too long");
+        assert!(fit(body(Value::Null), 20).is_err());
+    }
 }

@@ -55,7 +55,7 @@ pub fn run(args: &ServiceArgs) -> ExitCode {
     match serve(args) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
-            tracing::error!("{e:#}");
+            tracing::error!("{}", crate::terminal::error_text(&e));
             ExitCode::FAILURE
         }
     }
@@ -138,6 +138,10 @@ fn bind_to_parent(parent: u32) -> anyhow::Result<()> {
     }
     let pid = Pid::from_raw(parent as i32).ok_or_else(gone)?;
     let pidfd = rustix::process::pidfd_open(pid, PidfdFlags::empty())?;
+    // Nor may the number mean another process by now.
+    if rustix::process::getppid() != Some(pid) {
+        return Err(gone());
+    }
     std::thread::Builder::new().name("orphan".into()).stack_size(64 * 1024).spawn(move || {
         let mut fds = [rustix::event::PollFd::new(&pidfd, rustix::event::PollFlags::IN)];
         while !matches!(rustix::event::poll(&mut fds, None), Ok(1..)) {}
@@ -165,6 +169,9 @@ fn start_log(level: &str) {
         .with_ansi(false)
         .with_target(false)
         .without_time()
+        // Nobody reads what a service says after the launcher's death; telling that on the same stream would panic, in the
+        // middle of taking outputs to their safe state.
+        .log_internal_errors(false)
         .try_init();
 }
 

@@ -14,6 +14,7 @@ use super::state_dir::SOCKET;
 use super::watch::Observed;
 use super::{Listeners, Options, Outcome};
 use crate::stackfile::{LaunchOptions, OnExhausted, StackSettings};
+use ipc_types::net::Seldom;
 use ipc_types::payload::HealthState;
 use ipc_types::reactor::{Reactor, Wake, signals};
 use ipc_types::{Stack, clock};
@@ -132,6 +133,9 @@ pub struct Supervisor {
     observed: Observed,
     losses: Vec<String>,
     output_waits: bool,
+    /// `None` while the control socket is not waited for, because nobody can be taken.
+    control_wake: Option<Wake>,
+    turned_away: Seldom,
 }
 
 fn rule_of(options: &LaunchOptions, recorder: bool) -> Rule {
@@ -167,7 +171,8 @@ impl Supervisor {
         let mut sources = HashMap::new();
         sources.insert(reactor.add(signal_fd.as_fd())?, Source::Signals);
         sources.insert(reactor.add(rail.bell())?, Source::Rail);
-        sources.insert(reactor.add(control.fd())?, Source::Control);
+        let control_wake = reactor.add(control.fd())?;
+        sources.insert(control_wake, Source::Control);
         sources.insert(reactor.add_timer(Duration::from_millis(TICK_MS))?, Source::Tick);
         let alarm = reactor.add_alarm()?;
         sources.insert(alarm, Source::Alarm);
@@ -200,6 +205,8 @@ impl Supervisor {
             observed: Observed::default(),
             losses: Vec::new(),
             output_waits: false,
+            control_wake: Some(control_wake),
+            turned_away: Seldom::default(),
             stack,
             executable,
             signal_fd,
@@ -227,7 +234,11 @@ impl Supervisor {
         self.perform();
         while !self.policy.ended() {
             self.set_alarm()?;
-            for wake in self.reactor.wait(None)?.to_vec() {
+            let woken = self.reactor.wait(None)?.to_vec();
+            // First the wish to end: who sends a signal to all processes of the stack at once wants no restarts.
+            self.handle(Source::Signals);
+            self.perform();
+            for wake in woken {
                 if let Some(source) = self.sources.get(&wake).copied() {
                     self.handle(source);
                     self.perform();
@@ -262,6 +273,10 @@ impl Supervisor {
         match source {
             Source::Signals => {
                 while let Some(number) = signals::take(&self.signal_fd) {
+                    // A terminal that closes tells it more than once; nobody sits there to hurry anything.
+                    if number == libc::SIGHUP && self.policy.stopping() {
+                        continue;
+                    }
                     let name = Exit::Signal { number, core: false }.signal_word();
                     self.policy.stop(&format!("{name} received"), clock::mono_ns());
                 }
@@ -272,15 +287,7 @@ impl Supervisor {
             Source::Death(service) => self.on_death(service),
             Source::Output(service) => self.read_output(service),
             Source::CleanerDeath => self.on_cleaner_death(),
-            Source::Control => {
-                for id in self.control.accept() {
-                    let Some(fd) = self.control.client_fd(id) else { continue };
-                    match self.reactor.add(fd) {
-                        Ok(wake) => drop(self.sources.insert(wake, Source::Client(id))),
-                        Err(_) => self.control.drop_client(id),
-                    }
-                }
-            }
+            Source::Control => self.take_clients(),
             Source::Client(id) => match self.control.hear(id) {
                 Heard::Gone => self.drop_client(id),
                 Heard::Requests(requests) => {
@@ -384,6 +391,7 @@ impl Supervisor {
     fn on_tick(&mut self) {
         let now = clock::mono_ns();
         self.ticks += 1;
+        self.listen_again();
         self.rail_ticks += 1;
         if self.rail_ticks >= RAIL_TICKS_MAX && !self.policy.stopping() {
             self.policy

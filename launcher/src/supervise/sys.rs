@@ -59,6 +59,15 @@ pub fn give_large_memory_back() {
     }
 }
 
+/// Makes deaths of children known: a starter that ignores SIGCHLD hands that down, and then the system throws away how a
+/// process ended.
+pub fn hear_of_children() {
+    // SAFETY: sets the default action of one signal; no handler of ours is involved.
+    unsafe {
+        libc::signal(libc::SIGCHLD, libc::SIG_DFL);
+    }
+}
+
 /// Lets no descriptor that the launcher's starter left open reach a service. Since Linux 5.11; older ones pass them
 /// on, which does no harm but keep a pipe open.
 pub fn keep_descriptors_private() {

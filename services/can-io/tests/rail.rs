@@ -58,7 +58,8 @@ fn frames_and_image() {
               "signals": [{ "start": 0, "len": 16, "from": "%QW0" }] },
             { "id": 0x211, "dlc": 1, "mode": "on_change", "signals": [{ "start": 7, "len": 1, "from": "%QX2.0" }] },
         ],
-        "stale_after": "500ms",
+        // A stale image is a part of this test, but not one that this thread published late by chance.
+        "stale_after": "3s",
     });
     let services =
         vec![("can0".into(), "can".into()), ("io".into(), "can-io".into()), ("plc".into(), "plc".into())];

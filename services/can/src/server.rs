@@ -104,6 +104,7 @@ impl<H: Host + 'static> Hub<H> {
         let before = inner.bus.counters().frames;
         let result = f(&mut inner.bus, &mut inner.host, now_ns);
         let bus = &mut inner.bus;
+        bus.take_feed_room_again();
         let feed_ns = inner.feed.as_mut().and_then(|p| p.play(now_ns, |frame| bus.push_feed(frame, now_ns)));
         let bus_ns = bus.run(now_ns, &mut inner.host);
         if bus.counters().frames != before {
@@ -120,7 +121,9 @@ impl<H: Host + 'static> Hub<H> {
         if bus.take_rail_room_again() {
             self.rail_room.notify_one();
         }
-        let next_ns = feed_ns.into_iter().chain(bus_ns).min();
+        // Who has another turn anyway finds the room then.
+        let room_ns = (bus.take_feed_room_again() && bus_ns.is_none()).then_some(now_ns);
+        let next_ns = feed_ns.into_iter().chain(bus_ns).chain(room_ns).min();
         if next_ns != inner.alarm_ns {
             inner.alarm_ns = next_ns;
             self.set_alarm(next_ns);

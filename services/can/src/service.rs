@@ -156,11 +156,16 @@ struct Rail {
 
 impl Tap for Rail {
     fn frame(&mut self, frame: &Frame, t_ns: u64, origin: Origin) {
+        let (flags, sender) = match origin {
+            Origin::Rail(sender) => (can_flag::TX_ECHO, sender),
+            _ => (0, 0),
+        };
         let message = CanFrame {
             can_id: frame.can_id,
             len: frame.len,
             fd_flags: frame.fd,
-            flags: if origin == Origin::Rail { can_flag::TX_ECHO } else { 0 },
+            flags,
+            sender,
             data: frame.data,
             ..CanFrame::default()
         };
@@ -215,7 +220,7 @@ impl Rail {
             let newest = message.flags & can_flag::NEWEST != 0;
             // What waited in the topic while a wire was down is as old as its stamp.
             let since_ns = if bus.has_wire() { message.stamp.t_ns.min(now_ns) } else { now_ns };
-            let pushed = bus.push_rail(&frame, newest, since_ns);
+            let pushed = bus.push_rail(&frame, newest, since_ns, (message.stamp.writer & 0xFF) as u8);
             debug_assert_ne!(pushed, Pushed::Refused, "room was asked for");
         });
         limit > 0 && taken == limit

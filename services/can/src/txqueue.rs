@@ -19,6 +19,8 @@ pub struct Waiting {
     pub arrived_ns: u64,
     /// CLOCK_MONOTONIC in ns at which its present value was queued.
     pub fresh_ns: u64,
+    /// Low bits of the number of the process that sent its present value.
+    pub sender: u8,
     newest: bool,
 }
 
@@ -66,7 +68,7 @@ impl TxQueue {
     /// A queue for at most `capacity` frames (at least 1).
     pub fn new(capacity: usize) -> Self {
         let capacity = capacity.max(1);
-        let empty = Waiting { frame: Frame::default(), arrived_ns: 0, fresh_ns: 0, newest: false };
+        let empty = Waiting { frame: Frame::default(), arrived_ns: 0, fresh_ns: 0, sender: 0, newest: false };
         Self {
             slots: vec![empty; capacity],
             newest_ids: vec![NO_ID; capacity],
@@ -98,10 +100,11 @@ impl TxQueue {
     }
 
     /// Queues a frame; `newest` lets it replace a waiting newest-value frame of the same identifier and kind.
-    pub fn push(&mut self, frame: &Frame, newest: bool, now_ns: u64) -> Pushed {
+    pub fn push(&mut self, frame: &Frame, newest: bool, now_ns: u64, sender: u8) -> Pushed {
         if newest && let Some(slot) = self.newest_ids.iter().position(|&id| id == frame.can_id) {
             self.slots[slot].frame = *frame;
             self.slots[slot].fresh_ns = now_ns;
+            self.slots[slot].sender = sender;
             self.counters.replaced += 1;
             return Pushed::Replaced;
         }
@@ -109,7 +112,8 @@ impl TxQueue {
             self.counters.refused += 1;
             return Pushed::Refused;
         };
-        self.slots[slot as usize] = Waiting { frame: *frame, arrived_ns: now_ns, fresh_ns: now_ns, newest };
+        self.slots[slot as usize] =
+            Waiting { frame: *frame, arrived_ns: now_ns, fresh_ns: now_ns, sender, newest };
         if newest {
             self.newest_ids[slot as usize] = frame.can_id;
         }
@@ -143,6 +147,16 @@ mod tests {
     use crate::protocol::candump::{format, parse};
     use proptest::prelude::*;
 
+    #[test]
+    fn a_newest_value_is_of_who_sent_it_last() {
+        let mut queue = TxQueue::new(16);
+        for (text, sender) in [("123#01", 3), ("123#02", 7)] {
+            queue.push(&parse(text).unwrap(), true, 0, sender);
+        }
+        let waiting = queue.pop().unwrap();
+        assert_eq!((format(&waiting.frame).as_str(), waiting.sender), ("123#02", 7));
+    }
+
     fn sent(queue: &mut TxQueue) -> String {
         let mut out = Vec::new();
         while let Some(waiting) = queue.pop() {
@@ -155,7 +169,7 @@ mod tests {
     fn by_identifier_then_by_arrival() {
         let mut queue = TxQueue::new(16);
         for text in ["300#01", "00000000#01", "100#01", "000#R", "300#02", "100#02", "000#01"] {
-            assert_eq!(queue.push(&parse(text).unwrap(), false, 0), Pushed::Queued);
+            assert_eq!(queue.push(&parse(text).unwrap(), false, 0, 0), Pushed::Queued);
         }
         assert_eq!(sent(&mut queue), "000#01 000#R 00000000#01 100#01 100#02 300#01 300#02");
     }
@@ -163,7 +177,7 @@ mod tests {
     #[test]
     fn newest_value_takes_the_place_of_the_waiting_one() {
         let mut queue = TxQueue::new(4);
-        let push = |queue: &mut TxQueue, text: &str, newest| queue.push(&parse(text).unwrap(), newest, 7);
+        let push = |queue: &mut TxQueue, text: &str, newest| queue.push(&parse(text).unwrap(), newest, 7, 0);
         assert_eq!(push(&mut queue, "200#01", true), Pushed::Queued);
         assert_eq!(push(&mut queue, "200#FF", false), Pushed::Queued);
         assert_eq!(push(&mut queue, "200#02", true), Pushed::Replaced);
@@ -200,7 +214,7 @@ mod tests {
                     model.push((id, i as u64, value, newest));
                     Pushed::Queued
                 };
-                prop_assert_eq!(queue.push(&frame, newest, 0), expected);
+                prop_assert_eq!(queue.push(&frame, newest, 0, 0), expected);
                 prop_assert_eq!(queue.len(), model.len());
                 if i % 7 == 6 && !model.is_empty() {
                     model.sort_unstable();

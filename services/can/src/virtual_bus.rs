@@ -7,8 +7,9 @@
 //! carries no more than `max_rate` frames a second. With pace the bus is busy as long as the frame takes on a wire.
 //! When frames have to wait, the node whose first frame wins arbitration goes next.
 //!
-//! What a client sends is never dropped: when its queue is full the caller stops reading its socket. What a
-//! client does not read is: frames that do not fit its output buffer are dropped for it alone, and counted.
+//! What a client sends is never dropped: when its queue is full the caller stops reading its socket. Only when a wire
+//! behind the bus has taken nothing for [`STALE_NS`] does the oldest frame go for each new one, so that clients that are
+//! gone are noticed and leave their places. What a client does not read is dropped: frames that do not fit its output buffer are dropped for it alone, and counted.
 //! A slow client never delays the bus. Nothing allocates between a frame in and a frame out.
 
 use std::collections::VecDeque;
@@ -17,8 +18,11 @@ use crate::protocol::busload::{LoadMeter, Stuffing, bits};
 use crate::protocol::{Frame, cannelloni, slcan, socketcand};
 use crate::txqueue::{Pushed, TxCounters, TxQueue};
 
+mod clients;
 mod texts;
 mod wire_side;
+use clients::{Client, Talk};
+pub use clients::{ClientCounters, Dialect, HANDSHAKE_HOLD_NS, Stopped, Taken};
 use texts::Texts;
 use wire_side::WireSide;
 pub use wire_side::{STALE_NS, WireCounters};
@@ -31,17 +35,11 @@ pub const CLIENT_QUEUE: usize = 256;
 pub const TURN_FRAMES: usize = 256;
 /// Frames that may exceed `max_rate` in one burst.
 pub const RATE_BURST: u64 = 1024;
-/// How long frames are held back after the `< ok >` that answers `< rawmode >`, unless the client speaks first:
-/// python-can compares its whole receive buffer with `< ok >`, so a frame behind it would break the handshake.
-pub const HANDSHAKE_HOLD_NS: u64 = 100_000_000;
-/// Answers to a client are dropped when its output buffer has less than this left, so frames go first.
-const REPLY_RESERVE: usize = 256;
-
 /// Where a frame came from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin {
-    /// A process of the stack.
-    Rail,
+    /// A process of the stack, with the low bits of its number; 0: which is not known.
+    Rail(u8),
     /// The recorded log.
     Feed,
     /// The client with this number.
@@ -73,84 +71,6 @@ pub struct Settings {
     pub tx_queue: usize,
     /// Bytes that may wait for a client.
     pub client_buffer: usize,
-}
-
-/// What a client speaks.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Dialect {
-    /// See [`crate::protocol::socketcand`].
-    Socketcand,
-    /// See [`crate::protocol::slcan`].
-    Slcan,
-    /// See [`crate::protocol::cannelloni`].
-    Cannelloni,
-}
-
-impl Dialect {
-    /// As keys and messages name it.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Socketcand => "socketcand",
-            Self::Slcan => "slcan",
-            Self::Cannelloni => "cannelloni",
-        }
-    }
-}
-
-#[derive(Debug)]
-enum Talk {
-    Socketcand { decoder: Box<socketcand::Decoder>, session: socketcand::Session },
-    Slcan { decoder: Box<slcan::Decoder>, session: slcan::Session },
-    Cannelloni { decoder: Box<cannelloni::Decoder>, greeted: bool },
-}
-
-/// Counters of one client.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
-pub struct ClientCounters {
-    /// Frames it put on the bus.
-    pub sent: u64,
-    /// Frames written to it.
-    pub received: u64,
-    /// Frames dropped because it did not read.
-    pub dropped: u64,
-    /// Commands answered with an error or BEL.
-    pub refused: u64,
-}
-
-#[derive(Debug)]
-struct Client {
-    talk: Talk,
-    /// Frames waiting for a paced bus, with their arrival.
-    waiting: VecDeque<(Frame, u64)>,
-    out: VecDeque<u8>,
-    /// Bytes of `out` that may be written before the hold ends.
-    hold: Option<(usize, u64)>,
-    /// Gone, but not all it sent is used yet: nothing is written for it any more.
-    muted: bool,
-    counters: ClientCounters,
-}
-
-/// What [`VirtualBus::take`] did with a client's bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Taken {
-    /// Bytes used; give the rest again later.
-    pub used: usize,
-    /// Why not all were used.
-    pub stopped: Option<Stopped>,
-}
-
-/// Why a client's bytes were not all used.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Stopped {
-    /// Its frames fill its queue: go on when the bus has taken some.
-    QueueFull,
-    /// An answer must leave as a segment of its own: go on when all output is written.
-    WriteFirst,
-    /// Write what is there, then close the connection.
-    Close,
-    /// Enough for one turn: go on after others had theirs.
-    Turn,
 }
 
 /// Counters of the bus.
@@ -189,6 +109,9 @@ pub struct VirtualBus {
     room_again: u32,
     /// The queue of the rail was full and is not any more.
     rail_room_again: bool,
+    /// A frame of the feed was refused since the last look, and one that waited has gone since.
+    feed_refused: bool,
+    feed_room_again: bool,
 }
 
 impl VirtualBus {
@@ -210,6 +133,8 @@ impl VirtualBus {
             output_ready: 0,
             room_again: 0,
             rail_room_again: false,
+            feed_refused: false,
+            feed_room_again: false,
             settings,
         }
     }
@@ -219,102 +144,9 @@ impl VirtualBus {
         self.utc_offset_ns = utc_offset_ns;
     }
 
-    /// A client came. `None`: [`MAX_CLIENTS`] are connected.
-    pub fn connect(&mut self, dialect: Dialect) -> Option<usize> {
-        let number = self.clients.iter().position(Option::is_none)?;
-        let limit = self.settings.client_buffer;
-        let mut client = Client {
-            talk: match dialect {
-                Dialect::Socketcand => {
-                    Talk::Socketcand { decoder: Box::default(), session: socketcand::Session::default() }
-                }
-                Dialect::Slcan => Talk::Slcan { decoder: Box::default(), session: slcan::Session::default() },
-                Dialect::Cannelloni => Talk::Cannelloni { decoder: Box::default(), greeted: false },
-            },
-            waiting: VecDeque::with_capacity(CLIENT_QUEUE),
-            out: VecDeque::with_capacity(limit),
-            hold: None,
-            muted: false,
-            counters: ClientCounters::default(),
-        };
-        let first: &[u8] = match dialect {
-            Dialect::Socketcand => socketcand::HI,
-            Dialect::Cannelloni => cannelloni::GREETING,
-            Dialect::Slcan => &[],
-        };
-        if !first.is_empty() {
-            client.out.extend(first);
-            self.output_ready |= 1 << number;
-        }
-        self.clients[number] = Some(client);
-        self.connected += 1;
-        Some(number)
-    }
-
-    /// A client reads nothing any more; what it sent may still come.
-    pub fn mute(&mut self, number: usize) {
-        if let Some(client) = self.clients.get_mut(number).and_then(Option::as_mut) {
-            client.muted = true;
-            client.out.clear();
-            client.hold = None;
-        }
-    }
-
-    /// A client is gone; its waiting frames go with it.
-    pub fn disconnect(&mut self, number: usize) -> ClientCounters {
-        self.wire_disown(number);
-        let gone = self.clients.get_mut(number).and_then(Option::take);
-        self.connected -= usize::from(gone.is_some());
-        gone.map(|client| client.counters).unwrap_or_default()
-    }
-
-    /// Uses bytes that a client sent: answers go to its output, frames on the bus.
-    pub fn take(&mut self, number: usize, bytes: &[u8], now_ns: u64, tap: &mut impl Tap) -> Taken {
-        let mut rest = bytes;
-        let mut stopped = None;
-        for _ in 0..TURN_FRAMES {
-            let Some(client) = self.clients.get_mut(number).and_then(Option::as_mut) else {
-                return Taken { used: bytes.len(), stopped: Some(Stopped::Close) };
-            };
-            if client.waiting.len() >= CLIENT_QUEUE {
-                stopped = Some(Stopped::QueueFull);
-                break;
-            }
-            let (step, frame) = client.step(&mut rest, &self.settings, now_ns);
-            if let Some(frame) = frame {
-                client.counters.sent += 1;
-                let waits = self.settings.pace || self.wire.is_some() || !client.waiting.is_empty();
-                if waits || !self.allow(now_ns) {
-                    if let Some(client) = &mut self.clients[number] {
-                        client.waiting.push_back((frame, now_ns));
-                    }
-                } else {
-                    self.on_bus(&frame, Origin::Client(number), now_ns, tap);
-                }
-            }
-            match step {
-                Step::More => {}
-                Step::Empty => break,
-                Step::Stop(why) => {
-                    stopped = Some(why);
-                    break;
-                }
-            }
-        }
-        if let Some(client) = self.clients[number].as_ref()
-            && !client.out.is_empty()
-        {
-            self.output_ready |= 1 << number;
-        }
-        if stopped.is_none() && !rest.is_empty() {
-            stopped = Some(Stopped::Turn);
-        }
-        Taken { used: bytes.len() - rest.len(), stopped }
-    }
-
-    /// Queues a frame of a process of the stack.
-    pub fn push_rail(&mut self, frame: &Frame, newest: bool, now_ns: u64) -> Pushed {
-        self.rail.push(frame, newest, now_ns)
+    /// Queues a frame of a process of the stack, `sender` being the low bits of its number.
+    pub fn push_rail(&mut self, frame: &Frame, newest: bool, now_ns: u64, sender: u8) -> Pushed {
+        self.rail.push(frame, newest, now_ns, sender)
     }
 
     /// Frames of the rail that can still be queued.
@@ -327,10 +159,14 @@ impl VirtualBus {
         self.rail.len()
     }
 
-    /// Queues a frame of the feed; false: full, give it again later.
+    /// Queues a frame of the feed; false: full, give it again when there is room ([`Self::take_feed_room_again`]).
     pub fn push_feed(&mut self, frame: &Frame, now_ns: u64) -> bool {
         if self.feed.len() >= CLIENT_QUEUE {
-            return false;
+            if !self.wire.as_mut().is_some_and(WireSide::sheds) {
+                self.feed_refused = true;
+                return false;
+            }
+            self.feed.pop_front();
         }
         self.feed.push_back((*frame, now_ns));
         true
@@ -341,7 +177,7 @@ impl VirtualBus {
     pub fn run(&mut self, now_ns: u64, tap: &mut impl Tap) -> Option<u64> {
         if self.wire.is_some() {
             // The wire takes what waits when it can.
-            return None;
+            return self.wire_holds(now_ns);
         }
         for _ in 0..TURN_FRAMES {
             if let Some((frame, origin, end_ns, wire_ns)) = self.on_wire {
@@ -400,7 +236,7 @@ impl VirtualBus {
 
     /// The frame that wins arbitration among the first of every node.
     fn next_frame(&mut self) -> Option<(Frame, Origin, u64)> {
-        let rail = self.rail.peek().map(|w| (w.frame.arbitration_key(), Origin::Rail));
+        let rail = self.rail.peek().map(|w| (w.frame.arbitration_key(), Origin::Rail(w.sender)));
         let feed = self.feed.front().map(|(f, _)| (f.arbitration_key(), Origin::Feed));
         let clients = self.clients.iter().enumerate().filter_map(|(number, client)| {
             let (frame, _) = client.as_ref()?.waiting.front()?;
@@ -408,11 +244,14 @@ impl VirtualBus {
         });
         let (_, origin) = rail.into_iter().chain(feed).chain(clients).min_by_key(|(key, _)| *key)?;
         let (frame, arrived_ns) = match origin {
-            Origin::Rail => {
+            Origin::Rail(_) => {
                 self.rail_room_again |= self.rail.room() == 0;
                 self.rail.pop().map(|w| (w.frame, w.fresh_ns))?
             }
-            Origin::Feed => self.feed.pop_front()?,
+            Origin::Feed => {
+                self.feed_room_again |= std::mem::take(&mut self.feed_refused);
+                self.feed.pop_front()?
+            }
             Origin::Client(number) => {
                 let client = self.clients[number].as_mut()?;
                 self.room_again |= 1 << number;
@@ -435,7 +274,7 @@ impl VirtualBus {
     fn tell(&mut self, frame: &Frame, origin: Origin, t_ns: u64, tap: &mut impl Tap) {
         self.counters.frames += 1;
         match origin {
-            Origin::Rail => self.counters.from_rail += 1,
+            Origin::Rail(_) => self.counters.from_rail += 1,
             Origin::Feed => self.counters.from_feed += 1,
             Origin::Client(_) | Origin::Wire => {}
         }
@@ -473,47 +312,14 @@ impl VirtualBus {
         }
     }
 
-    /// Bytes to write to a client now, in one piece; empty when there are none.
-    pub fn output(&mut self, number: usize, now_ns: u64) -> &[u8] {
-        let Some(client) = self.clients.get_mut(number).and_then(Option::as_mut) else { return &[] };
-        let mut limit = usize::MAX;
-        match client.hold {
-            Some((_, until_ns)) if until_ns <= now_ns => client.hold = None,
-            Some((bytes, _)) => limit = bytes,
-            None => {}
-        }
-        let (first, _) = client.out.as_slices();
-        &first[..first.len().min(limit)]
-    }
-
-    /// So many bytes of [`Self::output`] have been written.
-    pub fn written(&mut self, number: usize, count: usize) {
-        if let Some(client) = self.clients.get_mut(number).and_then(Option::as_mut) {
-            client.out.drain(..count.min(client.out.len()));
-            if let Some((bytes, _)) = &mut client.hold {
-                *bytes = bytes.saturating_sub(count);
-            }
-        }
-    }
-
-    /// When the hold on a client's output ends, if there is one.
-    pub fn held_until(&self, number: usize) -> Option<u64> {
-        self.clients.get(number)?.as_ref()?.hold.map(|(_, until_ns)| until_ns)
-    }
-
-    /// Clients with new output since the last call, one bit each.
-    pub fn take_output_ready(&mut self) -> u32 {
-        std::mem::take(&mut self.output_ready)
-    }
-
-    /// Clients whose queue has room again since the last call, one bit each.
-    pub fn take_room_again(&mut self) -> u32 {
-        std::mem::take(&mut self.room_again)
-    }
-
     /// Whether the queue of the rail was full and has room again since the last call.
     pub fn take_rail_room_again(&mut self) -> bool {
         std::mem::take(&mut self.rail_room_again)
+    }
+
+    /// Whether the queue of the feed was full and has room again since the last call.
+    pub fn take_feed_room_again(&mut self) -> bool {
+        std::mem::take(&mut self.feed_room_again)
     }
 
     /// Load in per mille of the last second.
@@ -529,84 +335,6 @@ impl VirtualBus {
     /// Counters of the rail's transmit queue.
     pub fn tx_counters(&self) -> TxCounters {
         self.rail.counters()
-    }
-
-    /// Counters of one client.
-    pub fn client_counters(&self, number: usize) -> Option<ClientCounters> {
-        self.clients.get(number)?.as_ref().map(|client| client.counters)
-    }
-}
-
-enum Step {
-    /// A command was used.
-    More,
-    /// All bytes are used.
-    Empty,
-    Stop(Stopped),
-}
-
-impl Client {
-    /// Uses one command from `rest`.
-    fn step(&mut self, rest: &mut &[u8], settings: &Settings, now_ns: u64) -> (Step, Option<Frame>) {
-        match &mut self.talk {
-            Talk::Socketcand { decoder, session } => {
-                let Some(command) = decoder.next(rest) else { return (Step::Empty, None) };
-                // It speaks, so it has read the answer to its last command.
-                self.hold = None;
-                match session.handle(&command, &settings.name) {
-                    socketcand::Action::Transmit(frame) => (Step::More, Some(frame)),
-                    socketcand::Action::Refused => {
-                        self.counters.refused += 1;
-                        (Step::More, None)
-                    }
-                    socketcand::Action::Reply(text) => {
-                        self.counters.refused += u64::from(text.starts_with(b"< error"));
-                        if self.reply(text, settings) && command == socketcand::Command::RawMode {
-                            self.hold = Some((self.out.len(), now_ns + HANDSHAKE_HOLD_NS));
-                        }
-                        (Step::Stop(Stopped::WriteFirst), None)
-                    }
-                    socketcand::Action::ReplyAndClose(text) => {
-                        self.counters.refused += 1;
-                        self.reply(text, settings);
-                        (Step::Stop(Stopped::Close), None)
-                    }
-                }
-            }
-            Talk::Slcan { decoder, session } => {
-                let Some(command) = decoder.next(rest) else { return (Step::Empty, None) };
-                let (text, frame) = match session.handle(&command) {
-                    slcan::Action::Reply(text) => (text, None),
-                    slcan::Action::Transmit { frame, ack } => (ack, Some(frame)),
-                };
-                self.counters.refused += u64::from(text == slcan::BEL);
-                self.reply(text, settings);
-                (Step::More, frame)
-            }
-            Talk::Cannelloni { decoder, greeted } => match decoder.next(rest) {
-                None => (Step::Empty, None),
-                Some(cannelloni::Item::Greeted) => {
-                    *greeted = true;
-                    (Step::More, None)
-                }
-                // Nobody puts an error on a bus on purpose: the far side reports its own, which are none of ours.
-                Some(cannelloni::Item::Frame(frame)) if frame.is_error() => (Step::More, None),
-                Some(cannelloni::Item::Frame(frame)) => (Step::More, Some(frame)),
-                Some(cannelloni::Item::Lost(_)) => {
-                    self.counters.refused += 1;
-                    (Step::Stop(Stopped::Close), None)
-                }
-            },
-        }
-    }
-
-    /// False: dropped, because the client reads nothing. It cannot wait for what it does not read.
-    fn reply(&mut self, text: &[u8], settings: &Settings) -> bool {
-        let fits = !self.muted && self.out.len() + text.len() + REPLY_RESERVE <= settings.client_buffer;
-        if fits {
-            self.out.extend(text);
-        }
-        fits
     }
 }
 

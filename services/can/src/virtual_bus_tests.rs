@@ -87,7 +87,7 @@ fn a_frame_reaches_everyone_but_its_sender() {
     assert_eq!(read(&mut bus, c, now), "t12320AFF1388\r");
     assert_eq!(give(&mut bus, c, "R000000018\r", now, &mut tap), "Z\r");
     assert_eq!(read(&mut bus, a, now), "< rtr 00000001 6.000000 8 >");
-    bus.push_rail(&parse("7FF#").unwrap(), false, now);
+    bus.push_rail(&parse("7FF#").unwrap(), false, now, 0);
     assert_eq!(bus.run(now, &mut tap), None);
     assert_eq!(read(&mut bus, a, now), "< frame 7FF 6.000000  >");
     assert_eq!(
@@ -95,7 +95,7 @@ fn a_frame_reaches_everyone_but_its_sender() {
         vec![
             ("123#0AFF".into(), now, Origin::Client(a)),
             ("00000001#R8".into(), now, Origin::Client(c)),
-            ("7FF#".into(), now, Origin::Rail),
+            ("7FF#".into(), now, Origin::Rail(0)),
         ]
     );
     assert_eq!(
@@ -157,7 +157,7 @@ fn a_client_that_does_not_read_loses_whole_frames_and_delays_nobody() {
     let fast = socketcand_client(&mut bus, &mut tap);
     let mut received = 0;
     for i in 0..1000u32 {
-        bus.push_rail(&Frame::data(i % 2048, false, &[1; 8]).unwrap(), false, 0);
+        bus.push_rail(&Frame::data(i % 2048, false, &[1; 8]).unwrap(), false, 0, 0);
         bus.run(0, &mut tap);
         received += read(&mut bus, fast, HANDSHAKE_HOLD_NS).matches("< frame").count();
     }
@@ -194,7 +194,7 @@ fn a_paced_bus_takes_the_time_of_a_wire_and_arbitrates() {
     give(&mut bus, a, "< send 555 0 >< send 500 0 >", start, &mut tap);
     give(&mut bus, b, "< send 200 0 >", start, &mut tap);
     for text in ["400#", "100#"] {
-        bus.push_rail(&parse(text).unwrap(), false, start);
+        bus.push_rail(&parse(text).unwrap(), false, start, 0);
     }
     assert!(tap.0.is_empty());
     let mut now = start;
@@ -214,7 +214,7 @@ fn a_paced_bus_takes_the_time_of_a_wire_and_arbitrates() {
     // Woken late, it catches up: stamps are those of the wire, not of the wake.
     let late = now + 10_000_000;
     for i in 0..8 {
-        bus.push_rail(&Frame::data(i, false, &[]).unwrap(), false, late);
+        bus.push_rail(&Frame::data(i, false, &[]).unwrap(), false, late, 0);
     }
     bus.run(late, &mut tap);
     assert_eq!(bus.run(late + 1_000_000_000, &mut tap), None);
@@ -311,7 +311,7 @@ proptest! {
                     give(&mut bus, client, &format!("< send {id:03x} 0 >"), now, &mut tap);
                 }
                 None => {
-                    bus.push_rail(&Frame::data(id, false, &[]).unwrap(), false, now);
+                    bus.push_rail(&Frame::data(id, false, &[]).unwrap(), false, now, 0);
                 }
             }
             while let Some(next) = bus.run(now, &mut tap) {

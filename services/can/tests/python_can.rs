@@ -3,15 +3,14 @@
 
 #![allow(clippy::unwrap_used, reason = "a test may end like this")]
 
-use std::net::Ipv4Addr;
 use std::path::Path;
 use std::process::Command;
 use std::rc::Rc;
 
 use dinrail_can::protocol::Frame;
-use dinrail_can::server::{Host, Hub, listen};
+use dinrail_can::server::{Host, Hub};
 use dinrail_can::server_pty::Pty;
-use dinrail_can::virtual_bus::{Dialect, Origin, Settings, Tap};
+use dinrail_can::virtual_bus::{Dialect, Origin, Tap};
 
 struct Nobody;
 
@@ -26,21 +25,12 @@ impl Host for Nobody {
     }
 }
 
+mod common;
 #[path = "../../../tests/support/python.rs"]
 mod python;
-use python::python;
 
-fn settings() -> Settings {
-    Settings {
-        name: "can0".into(),
-        bitrate: 500_000,
-        data_bitrate: 2_000_000,
-        pace: false,
-        max_rate: 150_000,
-        tx_queue: 512,
-        client_buffer: 1 << 20,
-    }
-}
+use common::{local, serve, settings};
+use python::python;
 
 /// Two clients of one kind; see `python_rows.py`.
 fn row(kind: &str, dialect: Dialect) {
@@ -48,12 +38,10 @@ fn row(kind: &str, dialect: Dialect) {
     let dir = std::env::temp_dir().join(format!("dinrail-row-{kind}-{}", std::process::id()));
     std::fs::create_dir_all(&dir).unwrap();
     let link = dir.join("tty");
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    let (output, drops) = tokio::task::LocalSet::new().block_on(&runtime, async {
+    let (output, drops) = local(async {
         let hub = Hub::new(settings(), Nobody, None).unwrap();
-        let listener = listen(Ipv4Addr::LOCALHOST.into(), 0).await.unwrap();
-        let port = listener.local_addr().unwrap().port().to_string();
-        tokio::task::spawn_local(Rc::clone(&hub).serve(listener, dialect, None, 8));
+        let (address, _server) = serve(&hub, dialect).await;
+        let port = address.port().to_string();
         tokio::task::spawn_local(Pty::new(&link).unwrap().serve(Rc::clone(&hub)));
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python_rows.py");
         let mut peer = Command::new(python);
@@ -101,15 +89,12 @@ fn cannelloni() {
 #[test]
 fn all_on_one_bus() {
     let Some(python) = python() else { return };
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    let output = tokio::task::LocalSet::new().block_on(&runtime, async {
+    let output = local(async {
         let hub = Hub::new(settings(), Nobody, None).unwrap();
         hub.turn(|bus, _, _| bus.set_utc_offset(ipc_types::clock::utc_offset_ns()));
         let mut ports = Vec::new();
         for dialect in [Dialect::Socketcand, Dialect::Slcan] {
-            let listener = listen(Ipv4Addr::LOCALHOST.into(), 0).await.unwrap();
-            ports.push(listener.local_addr().unwrap().port().to_string());
-            tokio::task::spawn_local(Rc::clone(&hub).serve(listener, dialect, None, 8));
+            ports.push(serve(&hub, dialect).await.0.port().to_string());
         }
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python_can.py");
         let peer = std::thread::spawn(move || {

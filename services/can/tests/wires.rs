@@ -3,7 +3,6 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may end like this")]
 
 use std::cell::RefCell;
-use std::net::{Ipv4Addr, SocketAddr};
 use std::path::Path;
 use std::process::Command;
 use std::rc::Rc;
@@ -11,17 +10,20 @@ use std::time::{Duration, Instant};
 
 use dinrail_can::protocol::peer::Peer;
 use dinrail_can::protocol::{Frame, slcan_client, socketcand_client};
-use dinrail_can::server::{Host, Hub, listen};
+use dinrail_can::server::{Host, Hub};
 use dinrail_can::server_pty::Pty;
 use dinrail_can::txqueue::Pushed;
-use dinrail_can::virtual_bus::{Dialect, Origin, Settings, Tap};
+use dinrail_can::virtual_bus::{Dialect, Origin, Tap};
 use dinrail_can::wire::port::Target;
 use dinrail_can::wire::{Line, LinkStatus, remote};
 use ipc_types::event::Level;
-use tokio::task::{JoinHandle, LocalSet, spawn_local};
+use tokio::task::spawn_local;
 
+mod common;
 #[path = "../../../tests/support/python.rs"]
 mod python;
+
+use common::{local, serve, settings};
 
 /// Longest wait for anything; never a measure of speed.
 const PATIENCE: Duration = Duration::from_mins(1);
@@ -53,18 +55,6 @@ impl Host for Listener {
     }
 }
 
-fn settings() -> Settings {
-    Settings {
-        name: "can0".into(),
-        bitrate: 500_000,
-        data_bitrate: 2_000_000,
-        pace: false,
-        max_rate: 150_000,
-        tx_queue: 512,
-        client_buffer: 1 << 20,
-    }
-}
-
 /// A bus with its clock running and what was seen on it.
 fn bus() -> (Bus, Seen, Said) {
     let host = Listener::default();
@@ -80,23 +70,12 @@ fn bus() -> (Bus, Seen, Said) {
     (hub, seen, said)
 }
 
-async fn serve(hub: &Rc<Hub<Listener>>, dialect: Dialect) -> (SocketAddr, JoinHandle<()>) {
-    let listener = listen(Ipv4Addr::LOCALHOST.into(), 0).await.unwrap();
-    let address = listener.local_addr().unwrap();
-    (address, spawn_local(hub.clone().serve(listener, dialect, None, 8)))
-}
-
 async fn until(what: &str, mut check: impl FnMut() -> bool) {
     let start = Instant::now();
     while !check() {
         assert!(start.elapsed() < PATIENCE, "waited in vain for: {what}");
         tokio::time::sleep(Duration::from_millis(2)).await;
     }
-}
-
-fn local<F: Future>(work: F) -> F::Output {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    LocalSet::new().block_on(&runtime, work)
 }
 
 fn numbered(id: u32, i: u32) -> Frame {
@@ -106,7 +85,7 @@ fn numbered(id: u32, i: u32) -> Frame {
 /// All frames through the bus as a process of the stack would send them.
 async fn push_all(hub: &Rc<Hub<Listener>>, frames: &[Frame]) {
     for frame in frames {
-        while hub.turn(|bus, _, now_ns| bus.push_rail(frame, false, now_ns)) == Pushed::Refused {
+        while hub.turn(|bus, _, now_ns| bus.push_rail(frame, false, now_ns, 0)) == Pushed::Refused {
             tokio::task::yield_now().await;
         }
     }
@@ -148,7 +127,7 @@ async fn both_ways(
     until("all frames at both ends", || near_seen.borrow().len() >= all && far_seen.borrow().len() >= all)
         .await;
     let of = |seen: &Seen, ours: bool| -> Vec<Frame> {
-        seen.borrow().iter().filter(|(_, o)| (*o == Origin::Rail) == ours).map(|(f, _)| *f).collect()
+        seen.borrow().iter().filter(|(_, o)| (*o == Origin::Rail(0)) == ours).map(|(f, _)| *f).collect()
     };
     // By identifier, so the extra frames may overtake; within an identifier nothing does.
     let sorted = |mut frames: Vec<Frame>| {

@@ -266,6 +266,9 @@ pub struct Symbol {
     /// `%`-address as written in the source, if located.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub address: Option<String>,
+    /// Index into [`DebugMap::enumerations`] of a variable whose values have names.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub enumeration: Option<u32>,
     /// Place of the declaration: index into [`DebugMap::files`], line and column from 1.
     pub file: u32,
     pub line: u32,
@@ -277,6 +280,14 @@ impl Symbol {
     pub fn elements(&self) -> u64 {
         self.dims.iter().map(|(lo, hi)| (hi - lo + 1).max(0) as u64).product()
     }
+}
+
+/// An enumeration of the program.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Enumeration {
+    pub name: String,
+    /// Names with their values, in the order of the declaration.
+    pub values: Vec<(String, i64)>,
 }
 
 /// A task of the resource. Which tasks are due is decided by the host from the stamp and this table alone.
@@ -354,6 +365,8 @@ pub struct DebugMap {
     pub layout: Layout,
     pub tasks: Vec<Task>,
     pub symbols: Vec<Symbol>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub enumerations: Vec<Enumeration>,
     pub instances: Vec<Instance>,
     /// File names as given to the compiler.
     pub files: Vec<String>,

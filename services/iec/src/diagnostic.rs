@@ -4,7 +4,7 @@ use codespan_reporting::diagnostic::{Diagnostic as CsDiagnostic, Label as CsLabe
 use codespan_reporting::files::SimpleFiles;
 use codespan_reporting::term;
 
-use crate::Source;
+use crate::{Source, limits};
 
 /// A range of bytes in one source.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
@@ -93,6 +93,9 @@ impl Diagnostic {
     }
 }
 
+/// Bytes of a line that is shown in messages; of a longer one only the place is told.
+const LONG_LINE: usize = 2000;
+
 /// All diagnostics of a compilation with the sources they point into.
 #[derive(Debug, Clone, Default)]
 pub struct Diagnostics {
@@ -101,8 +104,13 @@ pub struct Diagnostics {
 }
 
 impl Diagnostics {
-    /// Diagnostics of these sources; sorted by place, errors and warnings mixed as they stand in the text.
+    /// Diagnostics of these sources; sorted by place, errors and warnings mixed as they stand in the text. Of very
+    /// many the first [`limits::ERRORS`], errors before warnings.
     pub fn new(sources: &[Source], mut items: Vec<Diagnostic>) -> Self {
+        if items.len() > limits::ERRORS {
+            items.sort_by_key(|d| d.severity);
+            items.truncate(limits::ERRORS);
+        }
         items.sort_by_key(|d| {
             let s = d.primary.as_ref().map_or(Span::default(), |p| p.span);
             (s.file, s.start, s.end)
@@ -141,6 +149,13 @@ impl Diagnostics {
             // Writing into a Vec cannot fail and all spans lie in their files (checked in `to_codespan`); should
             // the renderer refuse all the same, the bare message is still better than nothing.
             let before = buffer.len();
+            if let Some(place) = self.place_in_a_long_line(d) {
+                let word = if d.severity == Severity::Error { "error" } else { "warning" };
+                let help = d.help.as_ref().map_or_else(String::new, |h| format!("  = help: {h}\n"));
+                let text = format!("{word}[{}]: {}\n  at {place}\n{help}\n", d.code, d.message);
+                buffer.extend_from_slice(text.as_bytes());
+                continue;
+            }
             let result = if color {
                 let mut writer = term::termcolor::Ansi::new(&mut buffer);
                 term::emit_to_write_style(&mut writer, &config, &files, &cs)
@@ -153,6 +168,23 @@ impl Diagnostics {
             }
         }
         String::from_utf8_lossy(&buffer).into_owned()
+    }
+
+    /// `file:line:column` of a diagnostic that touches a line too long to be shown: a file may be one line of 1 MiB.
+    fn place_in_a_long_line(&self, d: &Diagnostic) -> Option<String> {
+        let line = |span: Span| {
+            let (_, text) = self.files.get(span.file as usize)?;
+            let at = floor_boundary(text, span.start as usize);
+            let start = text[..at].rfind('\n').map_or(0, |n| n + 1);
+            Some((at, start, text[start..].find('\n').unwrap_or(text.len() - start)))
+        };
+        let spans = d.primary.iter().chain(&d.secondary).map(|l| l.span);
+        let long = spans.filter_map(line).any(|(_, _, length)| length > LONG_LINE);
+        let primary = d.primary.as_ref().filter(|_| long)?.span;
+        let (name, text) = self.files.get(primary.file as usize)?;
+        let (at, start, _) = line(primary)?;
+        let number = text[..start].matches('\n').count() + 1;
+        Some(format!("{name}:{number}:{}", text[start..at].chars().count() + 1))
     }
 }
 

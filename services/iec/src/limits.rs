@@ -12,7 +12,7 @@ pub const NESTING: u32 = 64;
 pub const COMMENT_NESTING: u32 = 64;
 /// Characters of an identifier.
 pub const IDENT_CHARS: usize = 128;
-/// Statements of all sources together.
+/// Statements of all sources together; and of all program instances together.
 pub const STATEMENTS: usize = 500_000;
 /// Operators of one expression, parentheses and arguments included.
 pub const OPERATORS: usize = 1000;
@@ -22,8 +22,22 @@ pub const CHAIN: usize = 4096;
 pub const VARIABLES: usize = 16_384;
 /// Symbols of the debug map (instances flattened).
 pub const SYMBOLS: usize = 262_144;
-/// Nesting of function block instances in each other.
-pub const INSTANCE_DEPTH: u32 = 32;
+/// Nesting of function block instances, structures and arrays in each other.
+pub const INSTANCE_DEPTH: u32 = 64;
+/// Members of one structure.
+pub const MEMBERS: usize = 4096;
+/// Longest chain of calls.
+pub const CALL_DEPTH: u32 = 128;
+/// Errors of all files after which no further body is looked at.
+pub const ERRORS: usize = 1000;
+/// Inputs of one function; what every WebAssembly engine takes.
+pub const PARAMETERS: usize = 1000;
+/// Registers of one POU: inputs, variables of functions, loops, intermediate values; as above.
+pub const REGISTERS: usize = 50_000;
+/// Bytes of code of one POU; as above.
+pub const POU_CODE_BYTES: usize = 7_654_321;
+/// Runs of initial values that lie apart from each other; beyond, what lies between them is stored too.
+pub const DATA_RUNS: usize = 10_000;
 /// Elements of one array.
 pub const ARRAY_ELEMENTS: i128 = 4 * 1024 * 1024;
 /// Dimensions of one array.

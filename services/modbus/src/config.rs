@@ -168,6 +168,14 @@ pub struct SerialLine {
     pub answer_within: Span,
 }
 
+impl SerialLine {
+    /// Unit identifiers that get an answer on this line.
+    pub fn answers(&self) -> impl Iterator<Item = u8> {
+        let any = self.answer_255.then_some(crate::device::ANY_UNIT);
+        self.unit.0.iter().copied().chain(any)
+    }
+}
+
 fn unit_one() -> UnitIds {
     UnitIds(vec![1])
 }

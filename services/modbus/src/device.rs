@@ -35,8 +35,18 @@ impl Shared {
 /// One unit.
 #[derive(Clone, Debug)]
 struct UnitState {
+    /// Its own identifier; `None`: the device itself on TCP, which has many.
+    id: Option<u8>,
     map: usize,
     line: LineState,
+    /// Carried out the broadcast that is being served.
+    took: bool,
+}
+
+impl UnitState {
+    fn new(id: Option<u8>, map: usize) -> Self {
+        Self { id, map, line: LineState::default(), took: false }
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -73,7 +83,7 @@ impl Device {
     /// has map 0 and is units 0, 255 and those of `only`, or all others when that is `None`.
     pub fn tcp(only: Option<&[u8]>, own: &[(u8, usize)], shared: Shared) -> Self {
         let mut device = Self::new(Rules::Tcp, shared);
-        device.units.push(UnitState { map: 0, line: LineState::default() });
+        device.units.push(UnitState::new(None, 0));
         match only {
             None => device.slots.fill(0),
             Some(only) => {
@@ -101,7 +111,7 @@ impl Device {
     fn add(&mut self, units: &[(u8, usize)]) {
         for &(unit, map) in units {
             self.slots[usize::from(unit)] = self.units.len() as u16;
-            self.units.push(UnitState { map, line: LineState::default() });
+            self.units.push(UnitState::new(Some(unit), map));
         }
     }
 
@@ -164,7 +174,7 @@ impl Device {
         }
     }
 
-    /// Every unit carries it out; units that show the same map do that once.
+    /// Every unit carries it out that the rights allow it; units that show the same map do that once.
     fn broadcast(
         &mut self,
         pdu: &[u8],
@@ -176,9 +186,9 @@ impl Device {
         let own = pdu.first() == Some(&function::DIAGNOSTICS);
         for slot in 0..self.units.len() {
             let map = self.units[slot].map;
-            let done =
-                self.units[..slot].iter().any(|before| before.map == map && !before.line.is_listen_only());
+            let done = self.units[..slot].iter().any(|before| before.map == map && before.took);
             let state = &mut self.units[slot];
+            state.took = false;
             state.line.received(true);
             if state.line.is_listen_only() && !is_restart(pdu) {
                 state.line.only_listened();
@@ -189,8 +199,11 @@ impl Device {
                 state.line.processed(exception, false, false);
                 continue;
             }
+            let took = self.allows(slot, BROADCAST, pdu, peer);
             let outcome = self.execute(slot, BROADCAST, pdu, peer, image, out);
-            self.units[slot].line.processed(outcome.exception, false, false);
+            let state = &mut self.units[slot];
+            state.took = took;
+            state.line.processed(outcome.exception, false, false);
             last = Some(outcome);
         }
         Served::Silent(last)
@@ -219,6 +232,14 @@ impl Device {
         if answered { Served::Answer(outcome) } else { Served::Silent(Some(outcome)) }
     }
 
+    /// Whether this request may be carried out by this unit. One that does not come under the unit's own identifier
+    /// (a broadcast, 255 as "any") has to be allowed under both.
+    fn allows(&self, slot: usize, unit: u8, pdu: &[u8], peer: &Peer) -> bool {
+        let rights = &self.shared.rights;
+        let own = self.units[slot].id.filter(|id| *id != unit);
+        rights.allow(peer, unit, pdu) && own.is_none_or(|id| rights.allow(peer, id, pdu))
+    }
+
     fn execute(
         &mut self,
         slot: usize,
@@ -232,7 +253,7 @@ impl Device {
         let hidden = self.rules == Rules::Tcp
             && !self.shared.serial_codes_on_tcp
             && function::is_serial_line_only(code);
-        if hidden || !self.shared.rights.allow(peer, unit, pdu) {
+        if hidden || !self.allows(slot, unit, pdu, peer) {
             return refuse(code, Exception::IllegalFunction, out);
         }
         let state = &mut self.units[slot];

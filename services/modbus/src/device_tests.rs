@@ -137,3 +137,31 @@ fn serial_codes_and_rights() {
     let mut line = Device::line(&[(1, 0)], false, shared);
     assert_eq!(ask(&mut line, &mut image, 1, "07"), "076D");
 }
+
+fn with_rights(units: &[(u8, usize)], answer_255: bool, rights: &str) -> Device {
+    let rights = Rights::new(&serde_json::from_str::<Vec<RightsEntry>>(rights).unwrap(), &[]).unwrap();
+    Device::line(units, answer_255, Shared { rights: Rc::new(rights), ..Shared::open() })
+}
+
+#[test]
+fn what_a_unit_may_not_do_it_does_not_do_under_another_number_either() {
+    // Unit 5 is read only: neither a broadcast nor "any" gets around that.
+    let mut image = MemoryImage::new(10);
+    let mut device = with_rights(&[(5, 0), (6, 1)], true, r#"[ { "units": [5], "allow": "read" } ]"#);
+    assert_eq!(ask(&mut device, &mut image, 5, "06 0001 0001"), "8601");
+    assert_eq!(ask(&mut device, &mut image, 255, "06 0001 0001"), "8601");
+    assert_eq!(ask(&mut device, &mut image, 255, "03 0001 0001"), "03020000");
+    image.selected.clear();
+    assert_eq!(ask(&mut device, &mut image, 0, "06 0001 0001"), "");
+    assert_eq!((image.writes, image.selected.as_slice()), (1, &[1][..]), "unit 6 alone");
+    // A unit with the same map that may is not kept from it by one that may not, and once is enough.
+    let mut device =
+        with_rights(&[(5, 0), (6, 0), (7, 0)], false, r#"[ { "units": [5], "allow": "read" } ]"#);
+    let writes = image.writes;
+    assert_eq!(ask(&mut device, &mut image, 0, "06 0001 0002"), "");
+    assert_eq!((image.writes, image.holding[1]), (writes + 1, 2));
+    // Broadcasts themselves can be forbidden, with 0 as the unit.
+    let mut device = with_rights(&[(5, 0)], false, r#"[ { "units": [0], "allow": "nothing" } ]"#);
+    assert_eq!(ask(&mut device, &mut image, 0, "06 0001 0003"), "");
+    assert_eq!(ask(&mut device, &mut image, 5, "03 0001 0001"), "03020002");
+}

@@ -5,7 +5,7 @@
 //! stands in a foreign dialog can be taken for a request to us. What this service sent itself comes back as an echo:
 //! it confirms the answer and is never read as a request. An adapter that sends back what it is given, and is not
 //! configured so in the serial service, must not make us talk to ourselves: a frame equal to our last answer that is
-//! no request is dropped. No clock, no allocation.
+//! no request, or came while or right behind that left, is dropped. No clock, no allocation.
 
 use crate::device::{Device, Served};
 use crate::line_state::LineFault;
@@ -70,6 +70,9 @@ pub struct LineCounters {
     pub own_answers: u64,
 }
 
+/// A copy of our own answer may come back so long after that has left; USB adapters hold bytes back.
+const ECHO_NS: u64 = 50_000_000;
+
 /// Takes a frame to send; `false` when it cannot.
 pub type Send<'a> = dyn FnMut(&[u8]) -> bool + 'a;
 
@@ -93,6 +96,14 @@ pub struct Line {
     waiting: u32,
     last_answer: Box<[u8; rtu::MAX_ADU]>,
     last_len: usize,
+    /// Time of one character, 0 where bytes take none.
+    char_ns: u64,
+    /// The last answer, once it has left: until when its bytes were on the line, and when that was told.
+    sent_ns: Option<(u64, u64)>,
+    /// Our own answers come back, as one of them has proved.
+    echoing: bool,
+    /// When the frame that is being received began.
+    first_ns: u64,
     counters: LineCounters,
 }
 
@@ -113,8 +124,19 @@ impl Line {
             waiting: 0,
             last_answer: Box::new([0; rtu::MAX_ADU]),
             last_len: 0,
+            char_ns: 0,
+            sent_ns: None,
+            echoing: false,
+            first_ns: 0,
             counters: LineCounters::default(),
         }
+    }
+
+    /// With the time that one character takes on the line.
+    #[must_use]
+    pub fn with_char_ns(mut self, char_ns: u64) -> Self {
+        self.char_ns = char_ns;
+        self
     }
 
     /// The counters.
@@ -122,8 +144,14 @@ impl Line {
         &self.counters
     }
 
-    /// Forgets what was received: the server was switched off.
-    pub fn reset(&mut self) {
+    /// Forgets what was received, and what was sent and not confirmed: the server was switched off, and sees nothing
+    /// of the line meanwhile.
+    pub fn switched_off(&mut self) {
+        self.reset();
+        (self.next_seq, self.waiting) = (None, 0);
+    }
+
+    fn reset(&mut self) {
         (self.len, self.flags) = (0, 0);
         self.receiver.reset();
     }
@@ -132,7 +160,10 @@ impl Line {
     pub fn chunk(&mut self, chunk: &SerialChunk, bytes: &[u8], image: &mut dyn Image, send: &mut Send<'_>) {
         self.follow(chunk);
         if chunk.flags & serial_flag::TX_ECHO != 0 {
-            return self.echo(chunk);
+            return self.echo(chunk, bytes.len());
+        }
+        if self.len == 0 {
+            self.first_ns = chunk.first_t_ns;
         }
         self.flags |= chunk.flags;
         match self.mode {
@@ -150,15 +181,14 @@ impl Line {
             if known == generation && seq > next {
                 self.counters.lost += seq - next;
             }
-            if known != generation {
-                self.waiting = 0;
-            }
+            // The echo of an answer may be among what was lost.
+            self.waiting = 0;
             self.reset();
         }
         self.next_seq = Some((generation, seq.wrapping_add(1)));
     }
 
-    fn echo(&mut self, chunk: &SerialChunk) {
+    fn echo(&mut self, chunk: &SerialChunk, len: usize) {
         if chunk.tx_writer != self.writer || chunk.tx_generation != self.generation {
             return;
         }
@@ -167,6 +197,10 @@ impl Line {
             self.counters.not_sent += 1;
         } else if chunk.flags & serial_flag::END != 0 {
             self.counters.sent += 1;
+            // The driver may notice the end late, and a pseudo-terminal takes no time at all.
+            let took_ns = chunk.stamp.t_ns.saturating_sub(chunk.first_t_ns);
+            let on_line_ns = took_ns.min(self.char_ns.saturating_mul(len as u64));
+            self.sent_ns = Some((chunk.first_t_ns.saturating_add(on_line_ns), chunk.stamp.t_ns));
         } else {
             return;
         }
@@ -226,6 +260,10 @@ impl Line {
                 }
             }
         }
+        if flags & serial_flag::END != 0 && self.receiver.reset() {
+            // The driver gave it up: silent for too long, or too long.
+            self.broken(&FrameError::End);
+        }
         if !self.receiver.is_inside() {
             self.flags = 0;
         }
@@ -260,10 +298,28 @@ impl Line {
         self.device.fault(LineFault::Damaged);
     }
 
+    /// Whether this is our last answer, sent back by the adapter. Some answers look like their requests (functions 5,
+    /// 6, 8, 21, 22), and a master may repeat a request at any time: such a one is an echo if it began before our
+    /// answer had left, and, where the adapter is known to send back, if it came right behind that.
+    fn is_own(&mut self, unit: u8, pdu: &[u8]) -> bool {
+        let last = &self.last_answer[..self.last_len];
+        if last.split_first() != Some((&unit, pdu)) {
+            return false;
+        }
+        let began_before = |end_ns: u64| self.first_ns < end_ns;
+        if decode_request(pdu).is_err() || self.sent_ns.is_some_and(|(end_ns, _)| began_before(end_ns)) {
+            self.echoing = true;
+            return true;
+        }
+        // Not yet told to have left: in ASCII the copy may be whole before that.
+        let right_behind =
+            self.sent_ns.is_none_or(|(_, told_ns)| began_before(told_ns.saturating_add(ECHO_NS)));
+        self.echoing && right_behind
+    }
+
     /// An undamaged frame.
     fn frame(&mut self, unit: u8, pdu: &[u8], image: &mut dyn Image, send: &mut Send<'_>) {
-        let last = &self.last_answer[..self.last_len];
-        if last.split_first() == Some((&unit, pdu)) && decode_request(pdu).is_err() {
+        if self.is_own(unit, pdu) {
             self.counters.own_answers += 1;
             return;
         }
@@ -305,6 +361,7 @@ impl Line {
         self.last_answer[0] = unit;
         self.last_answer[1..=pdu.len()].copy_from_slice(pdu);
         self.last_len = pdu.len() + 1;
+        self.sent_ns = None;
         self.counters.answers += 1;
         if sent {
             self.waiting += 1;

@@ -213,6 +213,113 @@ fn an_adapter_that_sends_back_what_it_gets_does_not_make_us_talk_to_ourselves() 
 }
 
 #[test]
+fn nor_do_answers_that_look_like_requests() {
+    const MS: u64 = 1_000_000;
+    let write = rtu_of(5, &hex("06 0001 0007"));
+    let at = |bench: &mut Bench, first_ms: u64, bytes: &[u8]| {
+        bench.take(
+            SerialChunk { flags: serial_flag::END, first_t_ns: first_ms * MS, ..SerialChunk::default() },
+            bytes,
+        );
+        std::mem::take(&mut bench.sent)
+    };
+    let timed = || {
+        let mut bench = Bench::rtu();
+        bench.line = bench.line.with_char_ns(MS);
+        bench
+    };
+    // 8 bytes of 1 ms each begin to leave, and the driver tells of it.
+    let left = |bench: &mut Bench, first_ms: u64, told_ms: u64| {
+        let mut echo = SerialChunk {
+            flags: serial_flag::TX_ECHO | serial_flag::END,
+            first_t_ns: first_ms * MS,
+            tx_writer: WRITER,
+            tx_generation: 1,
+            ..SerialChunk::default()
+        };
+        echo.stamp.t_ns = told_ms * MS;
+        bench.take(echo, &write);
+    };
+    // A master may write the same value as fast as it likes, and repeat itself.
+    let mut bench = timed();
+    for n in 1..10 {
+        assert_eq!(at(&mut bench, n * 10, &write).len(), 1);
+        left(&mut bench, n * 10 + 1, n * 10 + 9);
+    }
+    // The driver may be late to tell that an answer has left: the line says when it had.
+    assert_eq!(at(&mut bench, 150, &write).len(), 1);
+    left(&mut bench, 151, 191);
+    assert_eq!(at(&mut bench, 160, &write).len(), 1);
+    left(&mut bench, 161, 192);
+    assert_eq!((bench.image.writes, bench.line.counters().own_answers), (11, 0));
+    // What began before our answer had left is that answer.
+    assert_eq!(at(&mut bench, 200, &write).len(), 1);
+    left(&mut bench, 201, 209);
+    assert!(at(&mut bench, 205, &write).is_empty());
+    // Now the adapter is known: what comes right behind is one too (a USB adapter held it back), later ones are not.
+    assert_eq!(at(&mut bench, 300, &write).len(), 1);
+    left(&mut bench, 301, 309);
+    assert!(at(&mut bench, 325, &write).is_empty());
+    assert_eq!(at(&mut bench, 400, &write).len(), 1);
+    assert!(at(&mut bench, 401, &write).is_empty(), "before it is told that the answer has left");
+    assert_eq!((bench.image.writes, bench.line.counters().own_answers), (14, 3));
+    // An answer that is no request proves it as well.
+    let mut bench = timed();
+    let answer = at(&mut bench, 0, &rtu_of(5, &hex("03 0000 0001"))).remove(0);
+    left(&mut bench, 1, 9);
+    assert!(at(&mut bench, 15, &answer).is_empty());
+    assert_eq!(at(&mut bench, 100, &write).len(), 1);
+    left(&mut bench, 101, 109);
+    assert!(at(&mut bench, 115, &write).is_empty());
+    // Where bytes take no time, no answer proves anything by its time.
+    let mut bench = Bench::rtu();
+    for n in 1..10 {
+        assert_eq!(at(&mut bench, n * 10, &write).len(), 1);
+        left(&mut bench, n * 10, n * 10 + 20);
+    }
+}
+
+#[test]
+fn an_ascii_frame_that_stops_is_over() {
+    let mut bench = Bench::new(Mode::Ascii, &[(5, 0)]);
+    let good = ascii_of(5, &hex("06 0000 0001"));
+    // The driver hands over what it has when the line was silent for its `timeout`.
+    bench.chunk(serial_flag::END, &good[..6]);
+    assert_eq!(bench.line.counters().malformed, 1);
+    assert!(bench.frame(&good[6..]).is_empty(), "its rest is noise");
+    assert_eq!(bench.frame(&good).len(), 1);
+    // In parts without an end it goes on.
+    bench.chunk(0, &good[..6]);
+    assert_eq!(bench.frame(&good[6..]).len(), 1);
+    assert_eq!(bench.line.counters().malformed, 1);
+}
+
+#[test]
+fn a_colon_is_no_delimiter() {
+    let mut bench = Bench::new(Mode::Ascii, &[(5, 0)]);
+    assert_eq!(bench.frame(&ascii_of(5, &hex("08 0003 3A00"))), [ascii_of(5, &hex("88 03"))]);
+    assert_eq!(bench.frame(&ascii_of(5, &hex("03 0000 0001"))).len(), 1);
+}
+
+#[test]
+fn what_passed_while_it_was_switched_off_is_not_lost_and_nothing_waits() {
+    let mut bench = Bench::rtu();
+    let good = rtu_of(5, &hex("06 0000 0001"));
+    assert_eq!(bench.frame(&good).len(), 1);
+    // Neither the echo of its answer nor anything else is seen.
+    bench.line.switched_off();
+    bench.seq += 7;
+    assert_eq!(bench.frame(&good).len(), 1);
+    let counters = bench.line.counters();
+    assert_eq!((counters.lost, counters.overlapped), (0, 0));
+    // Lost otherwise, it is counted, and no answer is waited for any more.
+    bench.seq += 7;
+    assert_eq!(bench.frame(&good).len(), 1);
+    let counters = bench.line.counters();
+    assert_eq!((counters.lost, counters.overlapped), (7, 0));
+}
+
+#[test]
 fn a_lost_part_makes_no_frame_of_its_neighbours() {
     let mut bench = Bench::rtu();
     let good = rtu_of(5, &hex("06 0000 0001"));

@@ -230,6 +230,37 @@ Error file[0]: file 1: it reaches byte 6002 of %M, which has 4096; make it small
 }
 
 #[test]
+fn a_unit_of_a_line_has_one_server() {
+    let mut stack = stack(&[("plc", "{}")]);
+    let server = |json: &str| ServiceEntry {
+        name: "other".to_owned(),
+        kind: KIND.to_owned(),
+        index: 2,
+        config: serde_json::from_str(json).unwrap(),
+        wiring: Wiring::default(),
+    };
+    let mine =
+        config(r#"{ "plc": "plc", "serial": [ { "port": "com1", "unit": [4, 5], "answer_255": true } ] }"#);
+    let mut said = Vec::new();
+    for theirs in [
+        r#"{ "serial": [ { "port": "com1", "unit": 5 } ] }"#,
+        r#"{ "serial": [ { "port": "com1", "unit": 6, "answer_255": true } ] }"#,
+        r#"{ "serial": [ { "port": "com1", "unit": 6 }, { "port": "com2", "unit": 5 } ] }"#,
+        "{ }",
+    ] {
+        stack.services.truncate(1);
+        stack.services.push(server(theirs));
+        said.extend(
+            check_it(&mine, &stack).iter().map(|f| format!("{}: {} -> {}", f.key, f.message, f.help)),
+        );
+    }
+    assert_snapshot!(said.join("\n"), @r#"
+serial[0].unit: unit 5 on 'com1' is answered by 'other' too -> two answers at once are none: give each unit of a line to one server
+serial[0].unit: unit 255 on 'com1' is answered by 'other' too -> two answers at once are none: give each unit of a line to one server
+"#);
+}
+
+#[test]
 fn addresses_count_as_in_the_plc() {
     let config = config(
         r#"{ "tcp": { "address": "127.0.0.1" }, "map": [

@@ -22,12 +22,16 @@ use tokio::io::AsyncReadExt;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
 
-/// A peer that does not take its answers is dropped after this time.
+/// A peer that does not take its answers is dropped after this time, also if it takes a part of them now and then.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
 /// A client whose last request came within this time after the answer before it gets [`EAGER_SPIN`].
 const EAGER_GAP: Duration = Duration::from_micros(50);
 /// How long the next request of such a client is awaited before the process sleeps. Bounds what it costs the others.
 const EAGER_SPIN: Duration = Duration::from_micros(20);
+/// Reads of such a client in a row until everything else has its turn: one that never pauses must not stop the service.
+const EAGER_TURNS: u32 = 64;
+/// A peer that vanished without a word is noticed after a minute: silence, then so many questions, each so long apart.
+const KEEP_ALIVE: (Duration, u32, Duration) = (Duration::from_secs(30), 3, Duration::from_secs(10));
 /// Pause after an accept that failed for want of descriptors or memory.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// RTU over TCP: a frame that was begun and does not go on for so long is noise. Longer than a lost segment takes to
@@ -395,6 +399,7 @@ impl<B: Backend + 'static> Hub<B> {
             self.update(|counters| counters.closed(CloseReason::Error));
             return;
         }
+        keep_alive(&stream);
         self.update(|counters| counters.accepted += 1);
         self.happened(Happening::Connected { peer });
         let now = Instant::now();
@@ -435,9 +440,14 @@ impl<B: Backend + 'static> Hub<B> {
 
     async fn serve(&self, mut stream: TcpStream, client: &Client) -> CloseReason {
         let mut session = Session::new(self.options.framing);
-        let mut eager = false;
+        let (mut eager, mut turns) = (false, 0);
         loop {
             let waiting = session.is_waiting();
+            turns += 1;
+            if turns == EAGER_TURNS {
+                tokio::task::yield_now().await;
+                turns = 0;
+            }
             let begin = Instant::now();
             // One client alone that asks again within microseconds: sleeping would cost it more than the wait does.
             let early = if eager && self.clients.borrow().len() == 1 {
@@ -466,7 +476,7 @@ impl<B: Backend + 'static> Hub<B> {
             }
             loop {
                 let next = self.process(&mut session, client);
-                if let Err(reason) = send(&stream, &mut session).await {
+                if let Err(reason) = send(&stream, &mut session, client).await {
                     return reason;
                 }
                 match next {
@@ -514,13 +524,36 @@ fn early(stream: &TcpStream, space: &mut [u8]) -> Option<io::Result<usize>> {
     None
 }
 
+/// Has the system ask whether an idle peer is still there: one that lost its power sends no end. Where that is not
+/// possible `idle_timeout` remains.
+fn keep_alive(stream: &TcpStream) {
+    use rustix::net::sockopt::{set_socket_keepalive, set_tcp_keepcnt, set_tcp_keepidle, set_tcp_keepintvl};
+    let (idle, count, interval) = KEEP_ALIVE;
+    let asked = set_socket_keepalive(stream, true)
+        .and_then(|()| set_tcp_keepidle(stream, idle))
+        .and_then(|()| set_tcp_keepintvl(stream, interval))
+        .and_then(|()| set_tcp_keepcnt(stream, count));
+    if let Err(error) = asked {
+        tracing::debug!(%error, "a Modbus connection cannot be watched for a peer that vanishes");
+    }
+}
+
 /// Writes the whole output: one system call unless the socket's buffer is full.
-async fn send(stream: &TcpStream, session: &mut Session) -> Result<(), CloseReason> {
+async fn send(stream: &TcpStream, session: &mut Session, client: &Client) -> Result<(), CloseReason> {
+    let mut end = None;
     while !session.output().is_empty() {
         match stream.try_write(session.output()) {
             Ok(n) => session.sent(n),
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
-                match tokio::time::timeout(WRITE_TIMEOUT, stream.writable()).await {
+                let end = *end.get_or_insert_with(|| tokio::time::Instant::now() + WRITE_TIMEOUT);
+                let writable = tokio::select! {
+                    biased;
+                    () = client.wake.notified() => {
+                        return Err(client.closing.get().unwrap_or(CloseReason::Disabled));
+                    }
+                    writable = tokio::time::timeout_at(end, stream.writable()) => writable,
+                };
+                match writable {
                     Ok(Ok(())) => {}
                     Ok(Err(_)) => return Err(CloseReason::Error),
                     Err(_) => return Err(CloseReason::NotReading),

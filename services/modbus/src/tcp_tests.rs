@@ -398,3 +398,66 @@ fn a_peer_that_sends_and_never_reads_does_not_stop_the_others() {
         until(|| hub.counters().closed_not_reading == 1).await;
     });
 }
+
+#[test]
+fn a_peer_that_does_not_read_is_closed_at_once_when_the_server_is_switched_off() {
+    with_server(Options::default(), |hub, address| async move {
+        let mut deaf = TcpStream::connect(address).await.unwrap();
+        let flood: Vec<u8> = (0..200).flat_map(|i| frame(i, 1, "03 0000 007D")).collect();
+        while let Ok(result) = timeout(Duration::from_millis(300), deaf.write_all(&flood)).await {
+            result.unwrap();
+        }
+        hub.set_enabled(false);
+        until(|| hub.clients().is_empty()).await;
+        let counters = hub.counters();
+        assert_eq!((counters.closed_disabled, counters.closed_not_reading), (1, 0));
+    });
+}
+
+#[test]
+fn one_client_that_never_pauses_leaves_the_service_its_turn() {
+    use std::io::{Read as _, Write as _};
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicBool, Ordering};
+    with_server(Options::default(), |hub, address| async move {
+        let stop = Arc::new(AtomicBool::new(false));
+        let mut sender = std::net::TcpStream::connect(address).unwrap();
+        let mut reader = sender.try_clone().unwrap();
+        // The longest requests: what one read takes is never more than one turn answers.
+        let longest: Vec<u8> =
+            (0..15).flat_map(|i| frame(i, 1, &format!("10 0000 007B F6 {}", "00".repeat(246)))).collect();
+        let flood = {
+            let stop = stop.clone();
+            std::thread::spawn(
+                move || while !stop.load(Ordering::Relaxed) && sender.write_all(&longest).is_ok() {},
+            )
+        };
+        let reading = std::thread::spawn(move || while matches!(reader.read(&mut [0; 4096]), Ok(1..)) {});
+        until(|| hub.counters().requests > 1000).await;
+        // What is served until everything else on this thread (timers, the rail, the heartbeat) has its turn.
+        let (mut most, mut before) = (0, hub.counters().requests);
+        for _ in 0..200 {
+            tokio::task::yield_now().await;
+            let now = hub.counters().requests;
+            (most, before) = (most.max(now - before), now);
+        }
+        assert!(most <= u64::from(EAGER_TURNS) * 17, "{most} requests in one turn");
+        until(|| hub.counters().requests > before + 1000).await;
+        stop.store(true, Ordering::Relaxed);
+        hub.set_enabled(false);
+        until(|| hub.clients().is_empty()).await;
+        flood.join().unwrap();
+        reading.join().unwrap();
+    });
+}
+
+#[test]
+fn a_peer_that_vanishes_is_asked_after() {
+    with_server(Options { idle_timeout: None, ..Options::default() }, |_, _| async move {
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
+        let stream = TcpStream::connect(listener.local_addr().unwrap()).await.unwrap();
+        keep_alive(&stream);
+        use rustix::net::sockopt::{socket_keepalive, tcp_keepidle};
+        assert_eq!((socket_keepalive(&stream), tcp_keepidle(&stream)), (Ok(true), Ok(KEEP_ALIVE.0)));
+    });
+}

@@ -1,6 +1,6 @@
 //! The whole service on a real rail: a thread runs `run`, this one plays launcher and PLC, a third is the client.
 
-#![allow(clippy::unwrap_used, reason = "helpers of a test, outside #[test] functions")]
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "helpers of a test, outside #[test] functions")]
 
 use ipc_types::image_write;
 use ipc_types::payload::{
@@ -25,6 +25,7 @@ const CONFIG: &str = r#"{
              { "table": "holding", "at": 100, "count": 2, "area": "%IW2", "own": true },
              { "table": "coils", "at": 0, "count": 64, "area": "%QX0.0" } ],
     "serial": [ { "port": "com1", "unit": 5 } ],
+    "stale_after": "2s",
     "enable_from": "%MX40.0",
     "clients_to": "%IB20"
 }"#;
@@ -33,8 +34,8 @@ const CONFIG: &str = r#"{
 enum Tell {
     /// Publish images in this state, or none.
     Scan(Option<PlcState>),
-    /// Put these bytes on the serial line as one frame, and answer with what comes back within a while.
-    Line(Vec<u8>, Sender<Vec<u8>>),
+    /// Put these bytes on the serial line as one frame, and answer with what comes back within this time.
+    Line(Vec<u8>, Sender<Vec<u8>>, Duration),
     /// Send this command, answer with the code of its result.
     Job(&'static str, Sender<u32>),
     /// Set a byte of %M.
@@ -111,9 +112,18 @@ fn rtu(pdu: &[u8]) -> Vec<u8> {
 
 impl Client {
     fn line(&self, frame: Vec<u8>) -> Vec<u8> {
+        self.line_within(frame, LONG).expect("an answer on the line")
+    }
+
+    /// Silence long enough to be one.
+    fn line_is_silent(&self, frame: Vec<u8>) -> bool {
+        self.line_within(frame, Duration::from_millis(500)).is_none()
+    }
+
+    fn line_within(&self, frame: Vec<u8>, limit: Duration) -> Option<Vec<u8>> {
         let (answer, shown) = channel();
-        self.tell.send(Tell::Line(frame, answer)).unwrap();
-        shown.recv_timeout(LONG).unwrap_or_default()
+        self.tell.send(Tell::Line(frame, answer, limit)).unwrap();
+        shown.recv_timeout(2 * LONG).ok()
     }
 
     fn job(&self, job: &'static str) -> u32 {
@@ -130,7 +140,7 @@ fn serial_line_and_switch(client: &mut Client) {
     assert_eq!(client.ask(&[3, 0, 3, 0, 1]), [3, 2, 0xAB, 0xCD]);
     let mut wrong = rtu(&[3, 0, 0, 0, 1]);
     wrong[2] ^= 1;
-    client.tell.send(Tell::Line(wrong, channel().0)).unwrap();
+    client.tell.send(Tell::Line(wrong, channel().0, LONG)).unwrap();
     // Counted: one damaged frame.
     assert_eq!(client.line(rtu(&[8, 0, 0x0C, 0, 0])), rtu(&[8, 0, 0x0C, 0, 1]));
     let port = client.stream.local_addr().unwrap().port().to_le_bytes();
@@ -145,13 +155,13 @@ fn serial_line_and_switch(client: &mut Client) {
     assert_eq!(client.job(r#"{ "do": "disable" }"#), 0);
     assert_eq!(client.stream.read(&mut [0; 1]).unwrap_or(0), 0, "the connection is closed");
     client.shows(|shown| shown.status["enabled"] == false && shown.status["listen"].is_null());
-    assert!(client.line(rtu(&[3, 0, 0, 0, 1])).is_empty());
+    assert!(client.line_is_silent(rtu(&[3, 0, 0, 0, 1])));
     assert_eq!(client.job(r#"{ "do": "enable" }"#), 0);
     client.shows(|shown| shown.status["enabled"] == true);
     assert_eq!(client.line(rtu(&[3, 0, 0, 0, 1])), rtu(&[3, 2, 0x12, 0x55]));
     client.tell.send(Tell::Marker(40, 0)).unwrap();
     client.shows(|shown| shown.status["enabled"] == false);
-    assert!(client.line(rtu(&[3, 0, 0, 0, 1])).is_empty());
+    assert!(client.line_is_silent(rtu(&[3, 0, 0, 0, 1])));
     client.tell.send(Tell::Marker(40, 1)).unwrap();
     client.shows(|shown| shown.status["enabled"] == true);
 }
@@ -317,8 +327,8 @@ fn play_plc(rail: &TestRail, told: &Receiver<Tell>) {
                 let _ = answer.send(bytes);
             }
         }
-        // Silence long enough to be one: the sender learns it by the end of its channel.
-        if asked.as_ref().is_some_and(|(_, since)| since.elapsed() > Duration::from_millis(500)) {
+        // The sender learns of silence by the end of its channel.
+        if asked.as_ref().is_some_and(|(_, end)| Instant::now() > *end) {
             asked = None;
         }
         results.drain(16, |result, _| {
@@ -336,8 +346,8 @@ fn play_plc(rail: &TestRail, told: &Receiver<Tell>) {
         });
         match told.recv_timeout(Duration::from_millis(2)) {
             Ok(Tell::Scan(wanted)) => state = wanted,
-            Ok(Tell::Line(bytes, answer)) => {
-                asked = Some((answer, Instant::now()));
+            Ok(Tell::Line(bytes, answer, limit)) => {
+                asked = Some((answer, Instant::now() + limit));
                 let header = SerialChunk { flags: serial_flag::END, ..SerialChunk::default() };
                 rx.send_tail(header, &bytes).unwrap();
                 rx.ring();

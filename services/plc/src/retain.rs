@@ -8,7 +8,7 @@
 mod file;
 mod shm;
 
-pub use file::{DiskCopy, read_file};
+pub use file::{CopyNews, DiskCopy, read_file};
 pub use shm::Mapping;
 
 use xxhash_rust::xxh3::Xxh3;

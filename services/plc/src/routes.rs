@@ -228,6 +228,9 @@ impl Route {
         }
         let raw = match end.elem {
             ElemType::Bool => u64::from(value.integer() != 0),
+            // The bits of a NaN that arithmetic leaves differ between processors; a replay may run on another.
+            ElemType::Real if value.real().is_nan() => u64::from(f32::NAN.to_bits()),
+            ElemType::Lreal if value.real().is_nan() => f64::NAN.to_bits(),
             ElemType::Real => u64::from((value.real() as f32).to_bits()),
             ElemType::Lreal => value.real().to_bits(),
             elem => value.fit(elem),
@@ -347,6 +350,45 @@ mod tests {
         assert_eq!(run(real)[..4], (-21.0f32).to_le_bytes());
         assert_eq!(run(config("%IX4.1", "%QX7.6"))[7], 0x40);
         assert_eq!(run(config("%IX4.2", "%QX7.6"))[7], 0);
+    }
+
+    #[test]
+    fn values_at_the_edges_of_their_types() {
+        let run = |from: &[u8], types: (&str, &str), scale: Option<f64>| {
+            let mut memory = [0u8; 48];
+            memory[..from.len()].copy_from_slice(from);
+            let letter = |t: &str| match elem_type(t).unwrap().bytes() {
+                1 => 'B',
+                2 => 'W',
+                4 => 'D',
+                _ => 'L',
+            };
+            let config = RouteConfig {
+                type_name: Some(types.0.to_owned()),
+                to_type: Some(types.1.to_owned()),
+                scale,
+                ..config(&format!("%I{}0", letter(types.0)), &format!("%Q{}0", letter(types.1)))
+            };
+            Route::new(&config, &PLAN).unwrap().run(&mut memory, false);
+            u64::from_le_bytes(memory[16..24].try_into().unwrap())
+        };
+        // Whole numbers without scale are exact, however large.
+        assert_eq!(run(&u64::MAX.to_le_bytes(), ("ULINT", "ULINT"), None), u64::MAX);
+        assert_eq!(run(&u64::MAX.to_le_bytes(), ("ULINT", "LINT"), None), i64::MAX as u64);
+        assert_eq!(run(&i64::MIN.to_le_bytes(), ("LINT", "ULINT"), None), 0);
+        assert_eq!(run(&(-129i16).to_le_bytes(), ("INT", "SINT"), None), 0x80);
+        for (x, expected) in
+            [(2.5f32, 2u64), (3.5, 4), (-0.5, 0), (1e30, 65535), (f32::NAN, 0), (f32::INFINITY, 65535)]
+        {
+            assert_eq!(run(&x.to_le_bytes(), ("REAL", "UINT"), None), expected, "{x}");
+        }
+        assert_eq!(run(&f32::NEG_INFINITY.to_le_bytes(), ("REAL", "INT"), None), 0x8000);
+        assert_eq!(run(&1e300f64.to_le_bytes(), ("LREAL", "REAL"), None), u64::from(f32::INFINITY.to_bits()));
+        // Whatever NaN comes or arises, one goes on.
+        for from in [0xFFC1_2345u32, f32::NAN.to_bits()] {
+            assert_eq!(run(&from.to_le_bytes(), ("REAL", "REAL"), None), 0x7FC0_0000);
+        }
+        assert_eq!(run(&f64::INFINITY.to_le_bytes(), ("LREAL", "LREAL"), Some(0.0)), 0x7FF8_0000_0000_0000);
     }
 
     #[test]

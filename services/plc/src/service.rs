@@ -90,6 +90,7 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
         let help = "see the page on the plc service for what a [[service.route]] takes";
         findings.push(Finding::error(&me.name, &format!("route[{i}]"), error.to_string(), help));
     }
+    check_retain_file(config, stack, &me.name, &mut findings);
     check_program(config, stack, &me.name, &setup, &mut findings);
     findings
 }
@@ -166,6 +167,26 @@ fn check_neighbours(config: &Config, stack: &Stack, me: &str, setup: &Setup, fin
     }
 }
 
+fn check_retain_file(config: &Config, stack: &Stack, me: &str, findings: &mut Vec<Finding>) {
+    let Some(file) = &config.retain_file else { return };
+    let path = stack.dir.join(file);
+    let folder = path.parent().filter(|f| !f.as_os_str().is_empty());
+    if path.is_dir() || folder.is_some_and(|f| !f.is_dir()) {
+        let what = if path.is_dir() { "is a folder" } else { "lies in a folder that does not exist" };
+        let message = format!("{} {what}", path.display());
+        findings.push(Finding::error(me, "retain_file", message, "name a file in a folder that exists"));
+    }
+    // Each would overwrite what the other keeps.
+    let other = stack.services.iter().filter(|s| s.kind == KIND && s.name != me).find(|s| {
+        let theirs = s.config.get("retain_file").and_then(serde_json::Value::as_str);
+        theirs.is_some_and(|f| stack.dir.join(f) == path)
+    });
+    if let Some(other) = other {
+        let message = format!("{} is the retain_file of service '{}' too", path.display(), other.name);
+        findings.push(Finding::error(me, "retain_file", message, "give each plc a file of its own"));
+    }
+}
+
 fn check_program(config: &Config, stack: &Stack, me: &str, setup: &Setup, findings: &mut Vec<Finding>) {
     if config.program.is_empty() {
         if config.cycle.is_none() && setup.routes.is_empty() && setup.inputs.is_empty() {
@@ -191,6 +212,14 @@ fn check_program(config: &Config, stack: &Stack, me: &str, setup: &Setup, findin
             }
             let map = &compiled.program.artifact.map;
             trigger::check_tasks(config, &map.tasks, me, findings);
+            for task in &map.tasks {
+                if let Some(ns) = task.interval_ns.filter(|ns| *ns < MIN_CYCLE.ns()) {
+                    let message = format!("TASK {} has an INTERVAL of {}", task.name, Span(ns));
+                    let help =
+                        "the shortest period is 100us: such a task would never leave time for anything else";
+                    findings.push(Finding::error(me, "program", message, help));
+                }
+            }
             for access in map.writes.iter().filter(|a| a.area == AreaKind::Input) {
                 let message = format!("{} assigns %IB{}", map.place_text(access.statement), access.byte);
                 let help = "inputs belong to the field: the value is overwritten at the next scan";

@@ -210,10 +210,10 @@ impl Tracer {
 }
 
 /// Runs a program against a case and stops at the first difference.
-pub fn trace_case(sources: Vec<SourceText>, case_json: &str) -> Result<CaseReport, TraceError> {
+pub fn trace_case(sources: Vec<SourceText>, setup: Setup, case_json: &str) -> Result<CaseReport, TraceError> {
     let case: Case = serde_json::from_str(case_json)?;
     let step_ns = (case.task_interval_ms * 1e6).round() as u64;
-    let mut tracer = Tracer::new(sources, Setup::default(), Some(step_ns))?;
+    let mut tracer = Tracer::new(sources, setup, Some(step_ns))?;
     let mut report = CaseReport {
         case: case.case.clone(),
         scans: 0,
@@ -252,11 +252,12 @@ pub fn trace_case(sources: Vec<SourceText>, case_json: &str) -> Result<CaseRepor
 /// All variables of every scan.
 pub fn trace_scans(
     sources: Vec<SourceText>,
+    setup: Setup,
     step_ns: Option<u64>,
     scans: u64,
     settings: &[Setting],
 ) -> Result<Vec<ScanTrace>, TraceError> {
-    let mut tracer = Tracer::new(sources, Setup::default(), step_ns)?;
+    let mut tracer = Tracer::new(sources, setup, step_ns)?;
     let mut out = Vec::new();
     for scan in 1..=scans {
         let now = settings.iter().filter(|s| s.scan == scan).map(|s| (s.variable.as_str(), &s.value));

@@ -6,6 +6,8 @@
 //!
 //! With [`Verifier::compare`] a second, changed program runs beside the recorded one on the same inputs.
 
+mod account;
+mod compare;
 mod diff;
 #[cfg(test)]
 mod tests;
@@ -15,9 +17,10 @@ pub(crate) use diff::{bytes_of, common};
 
 use crate::engine::{Engine, EngineError, Program, Runtime, RuntimeError, ScanOutcome, Stamps, write_result};
 use crate::setup::Setup;
+use compare::compare_record;
 use diff::differences;
 use dinrail_iec::artifact::TrapId;
-use ipc_types::scan_record::{Content, Fault, Head, Kind, Outcome, Patch, Reason, Section, flag};
+use ipc_types::scan_record::{Content, Head, Kind, Reason, Section, flag};
 use serde::Serialize;
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -29,6 +32,8 @@ const WAITING_RECORDS: usize = 4096;
 const OTHERS: usize = 8;
 /// Spans listed; beyond that they are only counted.
 const MAX_SPANS: usize = 1000;
+/// Doubts listed.
+const MAX_DOUBTS: usize = 100;
 
 /// Hands over the program with this hash, compiled for this setup.
 pub type Provider<'a> = Box<dyn FnMut(u64, &Setup) -> Option<Arc<Program>> + 'a>;
@@ -70,13 +75,16 @@ pub struct Report {
     pub scans_different: u64,
     pub first_difference: Option<Difference>,
     pub unverifiable: Vec<Unverifiable>,
+    /// Why more scans may have been than could be looked at: the recording is cut off, damaged, or messages were lost. Each is
+    /// a sentence.
+    pub incomplete: Vec<String>,
     pub keyframes_checked: u64,
 }
 
 impl Report {
-    /// 0 exact, 1 different, 3 exact but with unverifiable spans.
+    /// 0 exact and complete, 1 different, 3 exact but with unverifiable spans, or incomplete.
     pub fn exit_code(&self) -> u8 {
-        match (self.exact, self.unverifiable.is_empty()) {
+        match (self.exact, self.unverifiable.is_empty() && self.incomplete.is_empty()) {
             (false, _) => 1,
             (true, true) => 0,
             (true, false) => 3,
@@ -120,7 +128,12 @@ pub struct Verifier<'a> {
     reason: String,
     pending: Option<Waiting>,
     waiting: VecDeque<Waiting>,
-    last: (u32, u64),
+    /// Newest scan that was verified, found different or listed: what is newer must still be accounted for.
+    reached: Option<(u32, u64)>,
+    /// First scan accounted for.
+    begin: Option<(u32, u64)>,
+    /// Messages that are missing by their numbers.
+    gaps: u64,
     spans_left_out: u64,
     report: Report,
 }
@@ -136,7 +149,9 @@ impl<'a> Verifier<'a> {
             reason: "no keyframe before it".to_owned(),
             pending: None,
             waiting: VecDeque::new(),
-            last: (0, 0),
+            reached: None,
+            begin: None,
+            gaps: 0,
             spans_left_out: 0,
             report: Report { exact: true, ..Report::default() },
         })
@@ -149,10 +164,18 @@ impl<'a> Verifier<'a> {
         self
     }
 
-    /// Messages are missing here. Not necessary for correctness: numbers tell as well; it names the reason.
+    /// Messages of the scans are missing here. Numbers of scans tell as well, but for those at the end; it names the reason.
     pub fn gap(&mut self, messages: u64) {
+        self.gaps = self.gaps.saturating_add(messages.max(1));
         if self.position.is_none() && self.waiting.is_empty() {
             self.reason = format!("{messages} messages of the recording are lost");
+        }
+    }
+
+    /// The recording may lack more than its own numbers tell; the report says so.
+    pub fn doubt(&mut self, why: String) {
+        if self.report.incomplete.len() < MAX_DOUBTS {
+            self.report.incomplete.push(why);
         }
     }
 
@@ -161,6 +184,7 @@ impl<'a> Verifier<'a> {
         let content = match Content::parse(bytes) {
             Ok(content) => content,
             Err(error) => {
+                self.doubt(format!("a record is damaged: {error}"));
                 self.lose(format!("damaged: {error}"));
                 return Ok(());
             }
@@ -173,13 +197,13 @@ impl<'a> Verifier<'a> {
 
     /// No more contents follow.
     pub fn finish(mut self) -> Result<Report, VerifyError> {
-        if let Some(pending) = self.pending.take()
-            && let Ok(content) = Content::parse(&pending.bytes)
-        {
-            self.keyframe_now(pending.generation, &content)?;
+        self.take_pending(None)?;
+        self.list_waiting(None);
+        if self.gaps > 0 && self.report.unverifiable.is_empty() {
+            self.doubt(format!("{} messages of the scans are missing", self.gaps));
         }
-        while let Some(record) = self.waiting.pop_front() {
-            self.unverifiable(record.generation, record.scan, record.scan);
+        if self.report.scans == 0 {
+            self.doubt("there is no scan in it".to_owned());
         }
         if self.spans_left_out > 0
             && let Some(last) = self.report.unverifiable.last_mut()
@@ -192,6 +216,7 @@ impl<'a> Verifier<'a> {
     // --- keyframes ------------------------------------------------------------------------------------
 
     fn keyframe(&mut self, generation: u32, content: &Content<'_>) -> Result<(), VerifyError> {
+        self.take_pending(Some((generation, 0)))?;
         let ahead = self
             .position
             .as_ref()
@@ -209,7 +234,7 @@ impl<'a> Verifier<'a> {
         let load = head.start == Reason::Load as u8;
         if let Some(position) = &mut self.position {
             let same = position.generation == generation;
-            if same && head.scan < position.engine.scan() {
+            if generation < position.generation || (same && head.scan < position.engine.scan()) {
                 return Ok(());
             }
             if same && head.scan == position.engine.scan() && !load {
@@ -231,6 +256,16 @@ impl<'a> Verifier<'a> {
     fn restart(&mut self, generation: u32, content: &Content<'_>) -> Result<(), VerifyError> {
         self.position = None;
         let head = content.head;
+        // Whatever becomes of the keyframe: what lies before it and was not verified never will be.
+        self.list_up_to(generation, head.scan);
+        if memory_of(content).is_none_or(|memory| xxh3_64(memory) != head.memory_hash) {
+            self.doubt(format!(
+                "the keyframe after scan {} of generation {generation} is damaged",
+                head.scan
+            ));
+            self.lose("the keyframe is damaged".to_owned());
+            return Ok(());
+        }
         let setup = content.sections().find_map(|s| match s {
             Section::Setup(json) => serde_json::from_slice::<Setup>(json).ok(),
             _ => None,
@@ -267,13 +302,30 @@ impl<'a> Verifier<'a> {
         let before = engine.memory().to_vec();
         self.position = Some(Position { engine, other, generation, before });
         self.pending = None;
-        let waiting = std::mem::take(&mut self.waiting);
-        for record in waiting {
-            if (record.generation, record.scan) <= (generation, head.scan) {
-                self.unverifiable(record.generation, record.scan, record.scan);
-            } else if let Ok(content) = Content::parse(&record.bytes) {
+        for record in std::mem::take(&mut self.waiting) {
+            if let Ok(content) = Content::parse(&record.bytes) {
                 self.record(record.generation, &content)?;
             }
+        }
+        Ok(())
+    }
+
+    /// A keyframe that waits for the records before it is taken when none of them can come any more: when a newer one
+    /// does, or nothing.
+    fn take_pending(&mut self, newer: Option<(u32, u64)>) -> Result<(), VerifyError> {
+        if let Some(pending) = &self.pending
+            && newer.is_none_or(|newer| (pending.generation, pending.scan) < newer)
+            && let Some(pending) = self.pending.take()
+            && let Ok(keyframe) = Content::parse(&pending.bytes)
+        {
+            let reached = self.position.as_ref().map_or(0, |p| p.engine.scan());
+            if reached < pending.scan
+                || self.position.as_ref().is_some_and(|p| p.generation != pending.generation)
+            {
+                self.position = None;
+                self.reason = "lost".to_owned();
+            }
+            self.keyframe_now(pending.generation, &keyframe)?;
         }
         Ok(())
     }
@@ -282,20 +334,14 @@ impl<'a> Verifier<'a> {
 
     fn record(&mut self, generation: u32, content: &Content<'_>) -> Result<(), VerifyError> {
         let scan = content.head.scan;
-        if let Some(pending) = &self.pending
-            && (pending.generation, pending.scan) < (generation, scan)
-            && let Some(pending) = self.pending.take()
-            && let Ok(keyframe) = Content::parse(&pending.bytes)
-        {
-            let reached = self.position.as_ref().map_or(0, |p| p.engine.scan());
-            if reached < pending.scan {
-                self.missing(pending.generation, reached + 1, pending.scan);
-                self.position = None;
-            }
-            self.keyframe_now(pending.generation, &keyframe)?;
-        }
+        self.take_pending(Some((generation, scan)))?;
         let next = match &self.position {
             Some(p) if p.generation == generation => p.engine.scan() + 1,
+            // Of an engine that is gone: its record was overtaken by its successor's.
+            Some(p) if generation < p.generation => {
+                self.list_late(generation, scan);
+                return Ok(());
+            }
             Some(_) => {
                 self.lose("the engine started anew and its keyframe is missing".to_owned());
                 0
@@ -307,21 +353,25 @@ impl<'a> Verifier<'a> {
             return Ok(());
         }
         if scan < next {
+            self.list_late(generation, scan);
             return Ok(());
         }
         if scan > next {
-            self.missing(generation, next, scan - 1);
+            self.lose("lost".to_owned());
+            self.list(generation, next, scan - 1);
             self.lose("records before it are lost".to_owned());
             self.wait(generation, content);
             return Ok(());
         }
-        self.note(generation, scan);
         if content.head.flags & flag::INCOMPLETE != 0 {
-            self.reason = "the record was longer than its limit".to_owned();
-            self.unverifiable_now(generation, scan, scan);
+            self.lose("the record was longer than its limit".to_owned());
+            self.list(generation, scan, scan);
             self.lose("after a record that was longer than its limit".to_owned());
             return Ok(());
         }
+        self.begin.get_or_insert((generation, scan));
+        self.reached = Some((generation, scan));
+        self.report.scans += 1;
         self.verify(generation, content);
         Ok(())
     }
@@ -376,67 +426,6 @@ impl<'a> Verifier<'a> {
             others: rows,
         });
     }
-
-    // --- what cannot be verified ----------------------------------------------------------------------
-
-    fn lose(&mut self, reason: String) {
-        self.position = None;
-        self.reason = reason;
-    }
-
-    /// Holds a record back until a keyframe comes, for a while.
-    fn wait(&mut self, generation: u32, content: &Content<'_>) {
-        if self.waiting.len() == WAITING_RECORDS
-            && let Some(oldest) = self.waiting.pop_front()
-        {
-            self.unverifiable(oldest.generation, oldest.scan, oldest.scan);
-        }
-        self.waiting.push_back(Waiting {
-            generation,
-            scan: content.head.scan,
-            bytes: content.bytes().to_vec(),
-        });
-    }
-
-    fn missing(&mut self, generation: u32, from: u64, to: u64) {
-        self.report.scans += to + 1 - from;
-        let reason = std::mem::replace(&mut self.reason, "lost".to_owned());
-        self.unverifiable_now(generation, from, to);
-        self.reason = reason;
-    }
-
-    fn unverifiable(&mut self, generation: u32, from: u64, to: u64) {
-        self.note(generation, from);
-        // After a difference everything up to the next keyframe differs: that is no gap.
-        if self.reason == "after a difference" {
-            self.report.scans_different += 1;
-            return;
-        }
-        self.unverifiable_now(generation, from, to);
-    }
-
-    fn unverifiable_now(&mut self, generation: u32, from: u64, to: u64) {
-        if let Some(last) = self.report.unverifiable.last_mut()
-            && last.generation == generation
-            && last.to + 1 >= from
-        {
-            last.to = last.to.max(to);
-            return;
-        }
-        if self.report.unverifiable.len() == MAX_SPANS {
-            self.spans_left_out += 1;
-            return;
-        }
-        let reason = self.reason.clone();
-        self.report.unverifiable.push(Unverifiable { generation, from, to, reason });
-    }
-
-    fn note(&mut self, generation: u32, scan: u64) {
-        if (generation, scan) > self.last {
-            self.last = (generation, scan);
-            self.report.scans += 1;
-        }
-    }
 }
 
 fn memory_of<'c>(keyframe: &Content<'c>) -> Option<&'c [u8]> {
@@ -475,116 +464,4 @@ pub fn replay(engine: &mut Engine, content: &Content<'_>) -> ScanOutcome {
         }
     }
     engine.finish_with(killed.as_ref())
-}
-
-type Found = (String, Vec<VarDiff>);
-
-/// What of the record the engine's own record contradicts.
-fn compare_record(position: &Position, recorded: &Content<'_>) -> Option<Found> {
-    let engine = &position.engine;
-    let Ok(own) = Content::parse(engine.record()) else {
-        return Some(("the verifier's own record".to_owned(), Vec::new()));
-    };
-    if own.head == recorded.head && forces(&own) == forces(recorded) && changes_equal(&own, recorded) {
-        return None;
-    }
-    let row = |variable: &str, expected: String, got: String| {
-        Some((variable.to_owned(), vec![VarDiff { variable: variable.to_owned(), expected, got }]))
-    };
-    let (a, b) = (&recorded.head, &own.head);
-    let rows = memory_rows(position, recorded);
-    if !rows.is_empty() {
-        return Some(("memory".to_owned(), rows));
-    }
-    if let (Some(expected), Some(got)) = (forces(recorded), forces(&own))
-        && let Some((e, g)) = first_unequal(&expected, &got)
-    {
-        let at = e.or(g).map_or(0, |p| p.offset);
-        let (name, _) = crate::engine::value::name_of(engine.map(), engine.image(), at);
-        let text = |p: Option<Patch>| {
-            p.map_or("not forced".to_owned(), |p| format!("forced to {:?}", &p.value[..usize::from(p.len)]))
-        };
-        return row(&name, text(e), text(g));
-    }
-    if a.outcome != b.outcome {
-        let text = |o: u8, c: &Content<'_>| match (o, fault_of(c)) {
-            (o, Some(fault)) if o == Outcome::Trap as u8 => format!("fault: {}", fault.text),
-            (o, _) if o == Outcome::Ok as u8 => "no fault".to_owned(),
-            _ => "no task ran".to_owned(),
-        };
-        return row("outcome of the scan", text(a.outcome, recorded), text(b.outcome, &own));
-    }
-    if a.tasks_ran != b.tasks_ran {
-        return row("tasks that ran", format!("{:#b}", a.tasks_ran), format!("{:#b}", b.tasks_ran));
-    }
-    if (a.state_before, a.state_after) != (b.state_before, b.state_after) {
-        let text = |h: &Head| format!("{} then {}", h.state_before, h.state_after);
-        return row("state of the PLC", text(a), text(b));
-    }
-    if a.warnings != b.warnings {
-        return row("warnings of the program", a.warnings.to_string(), b.warnings.to_string());
-    }
-    if a.program_hash != b.program_hash {
-        return row("program", format!("{:016x}", a.program_hash), format!("{:016x}", b.program_hash));
-    }
-    if a.memory_hash != b.memory_hash && a.flags & flag::DATA_CUT == 0 {
-        // Every recorded byte agrees: what is left is the stamp in front of the image.
-        let got = format!("PLC time {} ns, UTC {} ns", b.plc_time_ns, b.utc_ns);
-        return row("the scan's stamp", "another".to_owned(), got);
-    }
-    row(
-        "a variable beyond the recorded changes",
-        format!("{:016x}", a.memory_hash),
-        format!("{:016x}", b.memory_hash),
-    )
-}
-
-fn fault_of<'c>(content: &Content<'c>) -> Option<Fault<'c>> {
-    content.sections().find_map(|s| match s {
-        Section::Fault(fault) => Some(fault),
-        _ => None,
-    })
-}
-
-fn forces(content: &Content<'_>) -> Option<Vec<Patch>> {
-    content.sections().find_map(|s| match s {
-        Section::Forces(table) => Some(table),
-        _ => None,
-    })
-}
-
-fn first_unequal(a: &[Patch], b: &[Patch]) -> Option<(Option<Patch>, Option<Patch>)> {
-    (0..a.len().max(b.len())).map(|i| (a.get(i).copied(), b.get(i).copied())).find(|(a, b)| a != b)
-}
-
-fn changes_equal(a: &Content<'_>, b: &Content<'_>) -> bool {
-    let list = |c: &Content<'_>| -> Option<Vec<(u32, Vec<u8>)>> {
-        c.sections().find_map(|s| match s {
-            Section::Changes(changes) => Some(changes.map(|(at, bytes)| (at, bytes.to_vec())).collect()),
-            _ => None,
-        })
-    };
-    list(a) == list(b)
-}
-
-/// Variables that differ between memory as recorded (before + changes) and as computed.
-fn memory_rows(position: &Position, recorded: &Content<'_>) -> Vec<VarDiff> {
-    let engine = &position.engine;
-    let mut expected = position.before.clone();
-    let mut known_to = 0u32;
-    for section in recorded.sections() {
-        let Section::Changes(changes) = section else { continue };
-        for (at, bytes) in changes {
-            if let Some(target) = expected.get_mut(at as usize..at as usize + bytes.len()) {
-                target.copy_from_slice(bytes);
-            }
-            known_to = at + bytes.len() as u32;
-        }
-    }
-    let cut = recorded.head.flags & flag::DATA_CUT != 0;
-    let (from, to) = engine.searched();
-    let data = engine.data_offset();
-    let known = |at: u32| at < to && (!cut || at < data.max(known_to));
-    let end = engine.state_end() as usize;
-    differences(engine, &expected[..end], &engine.memory()[..end], from, known, OTHERS + 1)
 }

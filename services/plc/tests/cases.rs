@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 use dinrail_iec::Source;
+use dinrail_plc::setup::Setup;
 use dinrail_plc::trace::{Setting, trace_case, trace_scans};
 use serde_json::json;
 use std::path::PathBuf;
@@ -27,7 +28,7 @@ fn sources(name: &str) -> Option<Vec<Source>> {
 fn run(name: &str) {
     let Some(sources) = sources(name) else { return };
     let case = std::fs::read_to_string(folder().unwrap().join(format!("{name}.case.json"))).unwrap();
-    let report = trace_case(sources, &case).unwrap_or_else(|e| panic!("{e}"));
+    let report = trace_case(sources, Setup::default(), &case).unwrap_or_else(|e| panic!("{e}"));
     assert!(report.values > 0);
     assert_eq!(report.first_difference, None);
 }
@@ -58,7 +59,7 @@ fn st_runtime_faults() {
         .filter(|sel| *sel != 5)
         .map(|sel| {
             let settings = [Setting { scan: 2, variable: "sel".into(), value: json!(sel) }];
-            let trace = trace_scans(sources.clone(), None, 3, &settings).unwrap();
+            let trace = trace_scans(sources.clone(), Setup::default(), None, 3, &settings).unwrap();
             assert_eq!(trace[0].fault, None);
             assert_eq!(trace[1].fault, trace[2].fault, "a fault stays");
             let fault = trace[1].fault.clone().unwrap_or_else(|| "no fault".into());

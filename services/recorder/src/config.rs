@@ -132,7 +132,7 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
     }
     for other in stack.services.iter().filter(|s| s.kind == me.kind && s.index < me.index) {
         let Ok(theirs) = serde_json::from_value::<Config>(other.config.clone()) else { continue };
-        if theirs.folder(&stack.dir) == dir {
+        if same_folder(&theirs.folder(&stack.dir), &dir) {
             findings.push(Finding::error(
                 &me.name,
                 "dir",
@@ -142,6 +142,12 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
         }
     }
     findings
+}
+
+/// Whether both names lead to one folder, by links or `..` too where it is there.
+fn same_folder(a: &Path, b: &Path) -> bool {
+    let real = |path: &Path| std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+    a == b || real(a) == real(b)
 }
 
 fn limits(config: &Config, me: &str, findings: &mut Vec<Finding>) {
@@ -286,6 +292,11 @@ mod tests {
         stack.services.push(other);
         let findings = check(&good, &stack, &me);
         assert!(findings[0].message.contains("'first' records into"), "{findings:?}");
+        // Under another name.
+        std::fs::create_dir(dir.path().join("recordings")).unwrap();
+        std::os::unix::fs::symlink("recordings", dir.path().join("link")).unwrap();
+        let linked = Config { dir: "link".into(), ..good.clone() };
+        assert!(check(&linked, &stack, &me)[0].message.contains("'first' records into"));
     }
 
     #[test]

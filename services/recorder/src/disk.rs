@@ -58,11 +58,15 @@ pub fn recordings(dir: &Path, stack: &str) -> Vec<Found> {
     listed(dir, stack, ENDING)
 }
 
-/// Number of this stack's newest recording in the folder, 0 when there is none.
+/// Number of this stack's newest recording in the folder, 0 when there is none. Reads names alone.
 pub fn last_number(dir: &Path, stack: &str) -> u64 {
-    let newest = recordings(dir, stack).pop();
-    let name = newest.as_ref().and_then(|f| f.path.file_name()?.to_str());
-    name.and_then(|name| parse_name(stack, name, ENDING)).map_or(0, |(_, n)| n)
+    let Ok(folder) = std::fs::read_dir(dir) else { return 0 };
+    folder.flatten().filter_map(|item| number(stack, item.file_name().to_str()?)).max().unwrap_or(0)
+}
+
+/// The number in a recording's name.
+fn number(stack: &str, name: &str) -> Option<u64> {
+    parse_name(stack, name, ENDING).map(|(_, n)| n)
 }
 
 /// Every `.mcap` file of the folder, of any stack and making, by name.
@@ -81,7 +85,7 @@ pub fn all_recordings(dir: &Path) -> io::Result<Vec<Found>> {
 /// Removes half-made copies of a sealing that was killed.
 pub fn remove_half_sealed(dir: &Path, stack: &str) {
     for found in listed(dir, stack, SEALING) {
-        if File::open(&found.path).is_ok_and(|file| lock(&file)) {
+        if open_locked(&found.path).is_ok_and(|(_file, lock)| matches!(lock, Lock::Taken)) {
             let _ = std::fs::remove_file(&found.path);
         }
     }
@@ -104,10 +108,41 @@ pub fn create(dir: &Path, stack: &str, utc_ns: i64, n: &mut u64) -> io::Result<(
     Err(io::Error::new(io::ErrorKind::AlreadyExists, "1000 files of this very millisecond exist"))
 }
 
-/// Takes the lock of a file that is being written or sealed; `false` when another process has it. It ends with
-/// the descriptor, so also with the process.
+/// What came of asking for a file's lock.
+#[derive(Debug)]
+pub enum Lock {
+    /// Ours until the descriptor is closed, so also until the process ends.
+    Taken,
+    /// Another descriptor has it: the file is being written or sealed.
+    InUse,
+    /// The file system knows no locks.
+    Unknown(io::Error),
+}
+
+/// Takes the lock of a file that is being written or sealed; `false` when it was not to be had.
 pub fn lock(file: &File) -> bool {
-    rustix::fs::flock(file, FlockOperation::NonBlockingLockExclusive).is_ok()
+    matches!(try_lock(file), Lock::Taken)
+}
+
+fn try_lock(file: &File) -> Lock {
+    match rustix::fs::flock(file, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => Lock::Taken,
+        Err(rustix::io::Errno::WOULDBLOCK) => Lock::InUse,
+        Err(e) => Lock::Unknown(e.into()),
+    }
+}
+
+/// Opens a file for its lock alone. For writing where that is allowed: file systems over a network give no exclusive lock
+/// without.
+pub fn open_locked(path: &Path) -> io::Result<(File, Lock)> {
+    let writing = OpenOptions::new().read(true).write(true).open(path);
+    let file = match writing {
+        Ok(file) => file,
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(e),
+        Err(_) => File::open(path)?,
+    };
+    let lock = try_lock(&file);
+    Ok((file, lock))
 }
 
 /// Whether a file ends as a finished recording does.
@@ -123,33 +158,6 @@ pub fn is_finished(path: &Path) -> bool {
         Ok(last == *mcap::MAGIC)
     };
     ends(path).unwrap_or(false)
-}
-
-/// Deletes files of this stack until all together take at most `keep` bytes: the oldest finished ones, and when those
-/// are not enough, the oldest unfinished ones, which could not be made whole. The current file and files in use stay.
-/// Returns what was deleted.
-pub fn enforce_quota(dir: &Path, stack: &str, keep: u64, current: Option<&Path>) -> Vec<Found> {
-    let mut all = recordings(dir, stack);
-    let mut total: u64 = all.iter().map(|f| f.bytes).sum();
-    let mut deleted = Vec::new();
-    if total <= keep {
-        return deleted;
-    }
-    all.sort_by_cached_key(|f| !is_finished(&f.path));
-    for found in all {
-        if total <= keep {
-            break;
-        }
-        let in_use = || !File::open(&found.path).is_ok_and(|file| lock(&file));
-        if Some(found.path.as_path()) == current || in_use() {
-            continue;
-        }
-        if std::fs::remove_file(&found.path).is_ok() {
-            total -= found.bytes;
-            deleted.push(found);
-        }
-    }
-    deleted
 }
 
 /// Bytes that this user may still write where the folder is or would be.
@@ -222,37 +230,6 @@ mod tests {
             assert_eq!(parse_name(stack, name, ENDING), None, "{name}");
         }
         assert!(parse_name("a-2", "a-2-19700101T000000.000-3.mcap", ENDING).is_some());
-    }
-
-    #[test]
-    fn the_oldest_finished_file_goes_first() {
-        let dir = TempDir::new("quota");
-        // The clock goes wrong after the sixth: the number says which is the newest.
-        let second = |n: u64| if n > 6 { n as i64 - 100 } else { n as i64 };
-        let names: Vec<_> = (1..=12).map(|n| file_name("s", second(n) * 1_000_000_000, n)).collect();
-        assert_eq!(last_number(dir.path(), "s"), 0);
-        for (i, name) in names.iter().enumerate() {
-            file(dir.path(), name, 1000, i != 1);
-        }
-        let stranger = file(dir.path(), "other-19700101T000000.000-1.mcap", 1000, true);
-        let held = File::open(dir.path().join(&names[2])).unwrap();
-        assert!(lock(&held));
-        let current = dir.path().join(&names[11]);
-        let deleted = enforce_quota(dir.path(), "s", 9500, Some(&current));
-        // 12000 bytes: 0 goes, 1 is unfinished, 2 is in use, 3 and 4 go.
-        let gone: Vec<_> = deleted.iter().map(|f| f.path.file_name().unwrap().to_str().unwrap()).collect();
-        assert_eq!(gone, [&names[0], &names[3], &names[4]]);
-        assert!(stranger.exists());
-        assert_eq!(all_recordings(dir.path()).unwrap().len(), 12 + 1 - 3);
-        assert_eq!(last_number(dir.path(), "s"), 12);
-        let left = || recordings(dir.path(), "s").into_iter().map(|f| f.path).collect::<Vec<_>>();
-        let of = |i: usize| dir.path().join(&names[i]);
-        // All finished ones before the first unfinished one.
-        enforce_quota(dir.path(), "s", 3000, Some(&current));
-        assert_eq!(left(), [of(1), of(2), current.clone()]);
-        // Nothing but protected files is left at last; the current one stays even above the quota.
-        enforce_quota(dir.path(), "s", 0, Some(&current));
-        assert_eq!(left(), [of(2), current]);
     }
 
     #[test]

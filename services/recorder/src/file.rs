@@ -4,13 +4,17 @@
 //! a chunk is closed when it is full or three seconds old, and until then its messages also stand *raw* behind the
 //! last chunk, as plain MCAP message records, which is where readers find them after kill -9. The chunk, when
 //! it is closed, takes their place. At every moment the file is a valid MCAP file without its end.
+//!
+//! MCAP knows no checksum of such messages. So private records with one stand among them, which other readers pass over:
+//! behind every flush, and every few kilobytes. Ours believes no raw message without.
 
 use crate::config::Compression;
+use crate::record::{Crc, op, raw_check};
 use crate::sink::Sink;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, McapError, McapResult, WriteOptions, Writer};
 use std::borrow::Cow;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::os::unix::fs::FileExt;
 use std::sync::Arc;
@@ -23,7 +27,8 @@ pub const CHUNK_BYTES: usize = 256 * 1024;
 pub const CHUNK_AGE: Duration = Duration::from_secs(3);
 /// Bytes of a message record before its data: opcode, length, channel, sequence, two times.
 const MESSAGE_HEAD: usize = 1 + 8 + 2 + 4 + 8 + 8;
-const OP_MESSAGE: u8 = 0x05;
+/// Bytes of raw messages after which a checksum stands: what a torn write can cost of them.
+const CHECK_EVERY: usize = 4096;
 /// Chunks after which a file is full, whatever its size: the MCAP writer keeps 136 bytes of each until the end, with
 /// indexes about 30 more a channel. A quiet stack closes one every three seconds: 27 h a file, and 4.3 MiB.
 pub const MAX_CHUNKS: u32 = 32_768;
@@ -36,13 +41,17 @@ pub struct RecordingFile {
     file: Arc<File>,
     /// Bytes of closed chunks and other records.
     written: Arc<AtomicU64>,
-    /// Bytes of raw messages behind them.
-    raw_in_file: u64,
-    /// Raw messages that are not in the file yet.
+    /// Raw messages of the open chunk, with their checksums.
     raw: Vec<u8>,
+    /// How many bytes of them are in the file, behind `written`.
+    raw_in_file: usize,
+    /// How many of them a checksum covers, and the checksum of all of them.
+    raw_checked: usize,
+    raw_crc: Crc,
     chunk_bytes: usize,
     chunk_since: Option<Instant>,
     chunks: u32,
+    copied_schemas: BTreeSet<u16>,
 }
 
 /// What a channel is made of.
@@ -85,11 +94,14 @@ impl RecordingFile {
             writer,
             file,
             written,
+            raw: Vec::with_capacity(CHUNK_BYTES + CHUNK_BYTES / 64),
             raw_in_file: 0,
-            raw: Vec::with_capacity(CHUNK_BYTES),
+            raw_checked: 0,
+            raw_crc: Crc::new(),
             chunk_bytes: 0,
             chunk_since: None,
             chunks: 0,
+            copied_schemas: BTreeSet::new(),
         })
     }
 
@@ -104,7 +116,8 @@ impl RecordingFile {
     /// Adds a channel of another file under its own number.
     pub fn copy_channel(&mut self, channel: &crate::reader::Channel) -> McapResult<()> {
         let (id, schema) = (channel.id, channel.schema_id);
-        if schema != 0 {
+        // Once each: the MCAP writer would compare the whole text.
+        if schema != 0 && self.copied_schemas.insert(schema) {
             let (name, encoding) = (&channel.schema_name, &channel.schema_encoding);
             self.writer.add_schema_with_id(schema, name, encoding, &channel.schema)?;
         }
@@ -127,14 +140,30 @@ impl RecordingFile {
         self.writer.write_to_known_channel(head, data)?;
         self.chunk_bytes += bytes;
         self.chunk_since.get_or_insert(now);
-        self.raw.push(OP_MESSAGE);
+        let from = self.raw.len();
+        self.raw.push(op::MESSAGE);
         self.raw.extend_from_slice(&((bytes - 9) as u64).to_le_bytes());
         self.raw.extend_from_slice(&head.channel_id.to_le_bytes());
         self.raw.extend_from_slice(&head.sequence.to_le_bytes());
         self.raw.extend_from_slice(&head.log_time.to_le_bytes());
         self.raw.extend_from_slice(&head.publish_time.to_le_bytes());
         self.raw.extend_from_slice(data);
+        self.raw_crc.add(&self.raw[from..]);
+        if self.raw.len() - self.raw_checked >= CHECK_EVERY {
+            self.check_raw();
+        }
         Ok(())
+    }
+
+    /// Puts the checksum behind the raw messages.
+    fn check_raw(&mut self) {
+        if self.raw.len() == self.raw_checked {
+            return;
+        }
+        let record = raw_check(self.raw_crc.value());
+        self.raw.extend_from_slice(&record);
+        self.raw_crc.add(&record);
+        self.raw_checked = self.raw.len();
     }
 
     /// Adds a message without its raw copy: for files that nobody reads before they are finished.
@@ -151,24 +180,31 @@ impl RecordingFile {
         if self.chunk_since.is_some_and(|since| now.duration_since(since) >= CHUNK_AGE) {
             return self.close_chunk();
         }
-        if !self.raw.is_empty() {
-            let at = self.written.load(Ordering::Relaxed) + self.raw_in_file;
-            self.file.write_all_at(&self.raw, at)?;
-            self.raw_in_file += self.raw.len() as u64;
-            self.raw.clear();
+        self.check_raw();
+        if self.raw_in_file < self.raw.len() {
+            let at = self.bytes();
+            self.file.write_all_at(&self.raw[self.raw_in_file..], at)?;
+            self.raw_in_file = self.raw.len();
         }
         Ok(())
     }
 
-    /// Closes the chunk; it takes the place of its raw messages.
+    /// Closes the chunk; it takes the place of its raw messages. When that fails they are put back as well as the disk allows.
     pub fn close_chunk(&mut self) -> McapResult<()> {
-        let raw_end = self.written.load(Ordering::Relaxed) + self.raw_in_file;
+        let (start, raw_end) = (self.written.load(Ordering::Relaxed), self.bytes());
+        if let Err(error) = self.writer.flush() {
+            // Only what stood there before: there may be no room for more.
+            let _ = self.file.write_all_at(&self.raw[..self.raw_in_file], start);
+            let _ = self.file.set_len(raw_end);
+            return Err(error);
+        }
         self.raw.clear();
         self.raw_in_file = 0;
+        self.raw_checked = 0;
+        self.raw_crc = Crc::new();
         self.chunks = self.chunks.saturating_add(u32::from(self.chunk_bytes > 0));
         self.chunk_bytes = 0;
         self.chunk_since = None;
-        self.writer.flush()?;
         let end = self.written.load(Ordering::Relaxed);
         if raw_end > end {
             self.file.set_len(end)?;
@@ -179,7 +215,9 @@ impl RecordingFile {
     /// Adds a metadata record.
     pub fn metadata(&mut self, name: &str, entries: BTreeMap<String, String>) -> McapResult<()> {
         self.close_chunk()?;
-        self.writer.write_metadata(&Metadata { name: name.to_owned(), metadata: entries })
+        self.writer.write_metadata(&Metadata { name: name.to_owned(), metadata: entries })?;
+        // The raw messages that follow must stand behind it, and what is in memory goes with the process.
+        self.writer.flush()
     }
 
     /// Adds a file.
@@ -191,12 +229,18 @@ impl RecordingFile {
             name: name.to_owned(),
             media_type: media_type.to_owned(),
             data: Cow::Borrowed(data),
-        })
+        })?;
+        self.writer.flush()
     }
 
     /// Bytes of the file now.
     pub fn bytes(&self) -> u64 {
-        self.written.load(Ordering::Relaxed) + self.raw_in_file
+        self.written.load(Ordering::Relaxed) + self.raw_in_file as u64
+    }
+
+    /// Chunks closed so far: when their number rises, all messages before are in the file.
+    pub fn chunks(&self) -> u32 {
+        self.chunks
     }
 
     /// Whether another file should begin, although this one may be small: [`MAX_CHUNKS`].
@@ -206,9 +250,10 @@ impl RecordingFile {
 
     /// Writes index and end.
     pub fn finish(mut self) -> McapResult<()> {
-        self.close_chunk()?;
-        self.writer.finish()?;
+        let ended = self.close_chunk().and_then(|()| self.writer.finish().map(drop));
+        // Taken apart, not dropped: the MCAP writer would try to end the file once more, over what was put back.
         let mut sink = self.writer.into_inner();
+        ended?;
         std::io::Write::flush(&mut sink).map_err(McapError::from)
     }
 
@@ -222,6 +267,7 @@ impl RecordingFile {
 mod tests {
     use super::*;
     use crate::format::gaps_channel;
+    use crate::record::RAW_CHECK_BYTES;
 
     fn head(channel_id: u16, sequence: u32) -> MessageHeader {
         MessageHeader { channel_id, sequence, log_time: 7, publish_time: 7 }
@@ -289,7 +335,7 @@ mod tests {
             assert_eq!(messages(&path).len() as u32, n, "in the file after each flush");
         }
         let (raw, before) = (file.bytes(), std::fs::read(&path).unwrap());
-        assert_eq!(raw - empty, 100 * (MESSAGE_HEAD as u64 + 100));
+        assert_eq!(raw - empty, 100 * (MESSAGE_HEAD + 100 + RAW_CHECK_BYTES) as u64);
         file.flush(start + CHUNK_AGE).unwrap();
         assert!(file.bytes() < raw, "the chunk is smaller than its raw messages");
         assert_eq!(file.bytes(), std::fs::metadata(&path).unwrap().len());

@@ -22,6 +22,10 @@ pub const META_RECORDING: &str = "dinrail.recording";
 pub const META_CLOCK: &str = "dinrail.clock";
 /// Metadata record of a file that [`crate::seal`] made whole.
 pub const META_SEALED: &str = "dinrail.sealed";
+/// Entry of [`META_RECORDING`]: how the messages behind the last chunk are protected ...
+pub const RAW_KEY: &str = "raw";
+/// ... by private records with the CRC-32 of everything from the end of the last chunk up to them.
+pub const RAW_CRC32: &str = "crc32";
 /// Attachment with the text of the stack file.
 pub const STACK_TEXT: &str = "stack.toml";
 /// Attachment with the resolved stack.
@@ -154,6 +158,7 @@ pub fn recording_metadata(
         ("recorder".to_owned(), recorder.to_owned()),
         ("recorder_generation".to_owned(), generation.to_string()),
         ("file".to_owned(), n.to_string()),
+        (RAW_KEY.to_owned(), RAW_CRC32.to_owned()),
     ])
 }
 

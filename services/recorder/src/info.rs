@@ -15,6 +15,8 @@ use std::path::{Path, PathBuf};
 pub const RATE_SPAN_S: f64 = 0.1;
 /// Clock jumps that are listed.
 const MAX_JUMPS: usize = 64;
+/// Attachments that are listed.
+const MAX_ATTACHMENTS: usize = 4096;
 
 /// One channel.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -49,6 +51,7 @@ pub struct AttachmentInfo {
 /// A recording.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Info {
+    #[serde(serialize_with = "lossy")]
     pub path: PathBuf,
     pub bytes: u64,
     /// Index and end are there.
@@ -67,10 +70,17 @@ pub struct Info {
     pub mb_per_h: f64,
     pub channels: Vec<ChannelInfo>,
     pub attachments: Vec<AttachmentInfo>,
+    /// Attachments that are not listed, because there are too many.
+    pub more_attachments: u64,
     /// UTC - CLOCK_MONOTONIC in ns at the start and at each jump.
     pub utc_offsets_ns: Vec<i64>,
     /// The recorder's last word on itself.
     pub gaps: Option<Gaps>,
+}
+
+/// Names need not be UTF-8; JSON is.
+fn lossy<S: serde::Serializer>(path: &Path, out: S) -> Result<S::Ok, S::Error> {
+    out.collect_str(&path.display())
 }
 
 #[derive(Default)]
@@ -118,6 +128,7 @@ pub fn info(path: &Path) -> Result<Info, ReadError> {
         mb_per_h: 0.0,
         channels: Vec::new(),
         attachments: Vec::new(),
+        more_attachments: 0,
         utc_offsets_ns: Vec::new(),
         gaps: None,
     };
@@ -129,6 +140,7 @@ pub fn info(path: &Path) -> Result<Info, ReadError> {
                 }
                 counts.entry(message.channel.id).or_default().add(&message);
             }
+            Item::Attachment(_) if info.attachments.len() >= MAX_ATTACHMENTS => info.more_attachments += 1,
             Item::Attachment(a) => {
                 let bytes = a.data.len() as u64;
                 let (name, media_type) = (a.name.to_owned(), a.media_type.to_owned());
@@ -189,29 +201,49 @@ fn sum_up(info: &mut Info, recording: &Recording, counts: &BTreeMap<u16, Count>)
     }
 }
 
+/// Characters of a name that are shown.
+const SHOWN: usize = 160;
+
+/// A file's own text, for a terminal: whatever it is, it neither moves the cursor nor fills the screen.
+fn shown(text: &str) -> String {
+    let clean = text.chars().map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c });
+    let mut shown: String = clean.take(SHOWN).collect();
+    if text.chars().nth(SHOWN).is_some() {
+        shown.push('…');
+    }
+    shown
+}
+
 impl fmt::Display for Info {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let of = |key: &str| self.recording.get(key).map_or("-", String::as_str);
-        writeln!(f, "{}", self.path.display())?;
+        self.fmt_head(f)?;
+        for damage in &self.end.damages {
+            let (at, reason, bytes) = (damage.offset, shown(&damage.reason), damage.bytes);
+            writeln!(f, "  damage     at byte {at}: {reason} ({bytes} bytes left out)")?;
+        }
+        self.fmt_channels(f)
+    }
+}
+
+impl Info {
+    fn fmt_head(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let of = |key: &str| self.recording.get(key).map_or_else(|| "-".to_owned(), |v| shown(v));
+        writeln!(f, "{}", shown(&self.path.display().to_string()))?;
         if self.recording.contains_key("imported_from") {
             let (from, what) = (of("imported_from"), of("imported_as"));
             let unknown = self.recording.get("direction").is_some_and(|v| v == "unknown");
             let direction = if unknown { "; it does not tell sent frames from received ones" } else { "" };
             writeln!(f, "  imported   from {from} ({what}), host {}{direction}", of("host"))?;
         } else {
-            writeln!(
-                f,
-                "  stack      {} ({}), build {}, host {}",
-                of("stack"),
-                of("stack_file"),
-                of("build"),
-                of("host")
-            )?;
+            let (stack, file, build, host) = (of("stack"), of("stack_file"), of("build"), of("host"));
+            writeln!(f, "  stack      {stack} ({file}), build {build}, host {host}")?;
         }
         writeln!(f, "  state      {}", self.state())?;
         if let Some(sealed) = &self.sealed {
-            let lost = sealed.get("bytes_lost").map_or("?", String::as_str);
-            writeln!(f, "  sealed     afterwards; {lost} bytes could not be read")?;
+            let lost = sealed.get("bytes_lost").map_or_else(|| "?".to_owned(), |v| shown(v));
+            let why = sealed.get("reason").filter(|v| !v.is_empty()).map(|v| format!(" ({})", shown(v)));
+            let why = why.unwrap_or_default();
+            writeln!(f, "  sealed     afterwards; {lost} bytes could not be read{why}")?;
         }
         if self.messages > 0 {
             let (first, last) = (utc::iso(self.first_ns), utc::iso(self.last_ns));
@@ -223,40 +255,39 @@ impl fmt::Display for Info {
             writeln!(f, "  clock      UTC jumped {} times", self.utc_offsets_ns.len() - 1)?;
         }
         if let Some(gaps) = &self.gaps {
-            writeln!(f, "  recorder   {}{}", gaps.text, if gaps.last { "" } else { " so far" })?;
+            writeln!(f, "  recorder   {}{}", shown(&gaps.text), if gaps.last { "" } else { " so far" })?;
         }
         if !self.attachments.is_empty() {
-            let files: Vec<_> =
-                self.attachments.iter().map(|a| format!("{} ({})", a.name, human(a.bytes))).collect();
+            let name = |a: &AttachmentInfo| format!("{} ({})", shown(&a.name), human(a.bytes));
+            let mut files: Vec<_> = self.attachments.iter().map(name).collect();
+            if self.more_attachments > 0 {
+                files.push(format!("and {} more", self.more_attachments));
+            }
             writeln!(f, "  files      {}", files.join(", "))?;
         }
-        for damage in &self.end.damages {
-            writeln!(
-                f,
-                "  damage     at byte {}: {} ({} bytes left out)",
-                damage.offset, damage.reason, damage.bytes
-            )?;
-        }
-        let width = self.channels.iter().map(|c| c.topic.len()).max().unwrap_or(0).max(5);
+        Ok(())
+    }
+
+    fn fmt_channels(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let topics: Vec<String> = self.channels.iter().map(|c| shown(&c.topic)).collect();
+        let width = topics.iter().map(|t| t.chars().count()).max().unwrap_or(0).max(5);
         writeln!(
             f,
             "  {:width$} {:>10} {:>12} {:>10} {:>8} {:>8}  schema",
             "topic", "messages", "bytes", "per s", "gaps", "missed"
         )?;
-        for c in &self.channels {
+        for (c, topic) in self.channels.iter().zip(topics) {
             let gaps = c.gaps.map_or("-".to_owned(), |g| g.to_string());
             let rate = c.rate.map_or("-".to_owned(), |r| format!("{r:.1}"));
+            let (messages, bytes, missed, schema) = (c.messages, c.bytes, c.missed, shown(&c.schema));
             writeln!(
                 f,
-                "  {:width$} {:>10} {:>12} {:>10} {:>8} {:>8}  {}",
-                c.topic, c.messages, c.bytes, rate, gaps, c.missed, c.schema
+                "  {topic:width$} {messages:>10} {bytes:>12} {rate:>10} {gaps:>8} {missed:>8}  {schema}"
             )?;
         }
         Ok(())
     }
-}
 
-impl Info {
     fn state(&self) -> String {
         let reason = self.end.reason.as_deref().unwrap_or("damaged");
         if self.finished && self.end.damaged == 0 {

@@ -3,6 +3,7 @@
 use ipc_types::payload::Stamp;
 use ipc_types::topic::TopicKind;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// A stream of messages.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -15,7 +16,8 @@ pub struct Channel {
     pub schema_id: u16,
     pub schema_name: String,
     pub schema_encoding: String,
-    pub schema: Vec<u8>,
+    /// Shared: a file may have thousands of channels of one large schema.
+    pub schema: Arc<[u8]>,
     pub metadata: BTreeMap<String, String>,
 }
 
@@ -83,6 +85,10 @@ pub struct Damage {
 pub struct End {
     /// Data, index and end are all there.
     pub finished: bool,
+    /// The checksum over all data held: not a bit of them is another one than was written, and none is missing.
+    pub checked: bool,
+    /// Messages that no checksum covered.
+    pub unchecked: u64,
     /// First byte that was not used.
     pub offset: u64,
     /// Bytes of data from there on that were not understood; 0 when the file ends between two records.

@@ -7,7 +7,7 @@
 //!
 //! Module by module: [`format`] what stands in a file; [`batch`] messages on their way from the rail to the
 //! writer; [`writer`] the thread that writes, rotates and stops when the disk is full; [`file`] one MCAP file;
-//! [`disk`] names, quota, free space; [`service`] the process; [`reader`] reading any recording, whole or cut
+//! [`disk`] names, locks, free space; `shelf` what lies in the folder, and the quota; [`service`] the process; [`reader`] reading any recording, whole or cut
 //! off at any byte; [`seal`] making a cut-off file whole; [`mod@info`] and [`mod@cat`] what `dinrail recordings` shows;
 //! [`scan`] the messages a verifier needs; [`replay`] a recording in a bus driver's place.
 
@@ -26,6 +26,7 @@ pub mod ros1;
 pub mod scan;
 pub mod seal;
 pub mod service;
+mod shelf;
 mod sink;
 mod sync;
 #[cfg(test)]

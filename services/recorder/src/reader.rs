@@ -3,19 +3,21 @@
 //! Streamed with bounded memory, never memory-mapped (a file that shrinks under a mapping kills the reader). No
 //! length of the file is trusted; nothing here panics. A file that ends early is no error: what is there is
 //! handed over, and [`Recording::end`] says where and why it ended. A chunk that fails its checksum is left
-//! out, counted, and reading goes on behind it.
+//! out, counted, and reading goes on behind it. What no checksum covered is counted too: whoever proves something from a
+//! recording must know.
 
-use crate::format::META_CLOCK;
+mod walk;
+
+use crate::format::{META_CLOCK, META_RECORDING, RAW_CRC32, RAW_KEY};
 pub use crate::item::{Attachment, Channel, Damage, End, Item, Message, Metadata, OwnedMessage};
-use crate::record::{
-    Bytes, Schema, attachment, chunk_head, crc32, kind_of, metadata, op, schema, stamp_of, tail_len,
-};
+use crate::record::{Bytes, Crc, Schema, attachment, kind_of, metadata, op, schema, stamp_of, tail_len};
 use ipc_types::payload::{Encoding, Stamp};
-use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use mcap::sans_io::LinearReader;
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{self, BufReader, Cursor, Read, Seek, SeekFrom};
+use std::io::{self, BufReader, Cursor, Read, Seek};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Largest chunk, compressed or not.
 pub const MAX_CHUNK: u64 = 64 << 20;
@@ -25,6 +27,8 @@ pub const MAX_RECORD: u64 = 64 << 20;
 pub const MAX_CHANNELS: usize = 4096;
 /// Most bytes of all schemas together.
 pub const MAX_SCHEMA_BYTES: usize = 16 << 20;
+/// Largest metadata record, and most bytes of all channels together: they are kept as maps, which take many times as much.
+pub const MAX_METADATA: u64 = 4 << 20;
 /// Damages that are remembered one by one; the rest is only counted.
 pub const MAX_DAMAGES: usize = 16;
 
@@ -35,6 +39,8 @@ pub enum ReadError {
     Open { path: PathBuf, source: io::Error },
     #[error("{path} is no MCAP file: it does not begin with MCAP's magic bytes")]
     NotMcap { path: PathBuf },
+    #[error("{path}: its attachments have more than {limit} bytes together; none of ours has")]
+    Attachments { path: PathBuf, limit: usize },
     #[error("{path}: reading at byte {offset} failed: {source}; copy the file from its medium and try again")]
     Io { path: PathBuf, offset: u64, source: io::Error },
 }
@@ -63,10 +69,17 @@ pub struct Recording {
     chunk: Vec<u8>,
     chunk_at: usize,
     chunk_offset: u64,
+    /// No checksum stands for what is in `chunk`.
+    chunk_unchecked: bool,
+    /// Raw messages of this file count only with their checksum behind them.
+    raw_checked: bool,
+    /// Of everything read, which is everything: nothing is skipped unread.
+    crc: Crc,
     decoder: Option<LinearReader>,
     schemas: BTreeMap<u16, Schema>,
     schema_bytes: usize,
     channels: BTreeMap<u16, Channel>,
+    channel_bytes: usize,
     utc_offset_ns: i64,
     end: End,
     ended: bool,
@@ -100,18 +113,23 @@ impl Recording {
             chunk: Vec::new(),
             chunk_at: 0,
             chunk_offset: 0,
+            chunk_unchecked: false,
+            raw_checked: false,
+            crc: Crc::new(),
             decoder: None,
             schemas: BTreeMap::new(),
             schema_bytes: 0,
             channels: BTreeMap::new(),
+            channel_bytes: 0,
             utc_offset_ns: 0,
             end: End::default(),
             ended: false,
         };
         let magic = mcap::MAGIC;
-        let there = magic.len().min(recording.len as usize);
+        let there = recording.len.min(magic.len() as u64) as usize;
         let mut start = [0u8; 8];
         recording.read_into(&mut start[..there])?;
+        recording.offset = there as u64;
         if start[..there] != magic[..there] {
             return Err(ReadError::NotMcap { path: path.to_owned() });
         }
@@ -158,6 +176,8 @@ impl Recording {
             match opcode {
                 op::MESSAGE => {
                     if self.message_at(place).is_some() {
+                        let covered = matches!(place, Place::Chunk { .. }) && !self.chunk_unchecked;
+                        self.end.unchecked += u64::from(!covered);
                         // Asked twice, because a borrow cannot be returned from within a loop that goes on.
                         return Ok(self.message_at(place).map(Item::Message));
                     }
@@ -173,7 +193,7 @@ impl Recording {
                 }
                 op::METADATA => match metadata(&self.record) {
                     Some(metadata) => {
-                        self.follow_clock(&metadata);
+                        self.follow(&metadata);
                         return Ok(Some(Item::Metadata(metadata)));
                     }
                     None => self.damage("a metadata record whose lengths do not fit"),
@@ -186,171 +206,6 @@ impl Recording {
     /// All messages, owned, in the order of the file.
     pub fn messages(self) -> Messages {
         Messages { recording: self }
-    }
-
-    fn bytes(&self, place: Place) -> &[u8] {
-        match place {
-            Place::Chunk { from, to } => self.chunk.get(from..to).unwrap_or_default(),
-            Place::Record => &self.record,
-        }
-    }
-
-    /// The next record, within the current chunk or of the file.
-    fn advance(&mut self) -> Result<Option<(u8, Place)>, ReadError> {
-        loop {
-            if self.chunk_at < self.chunk.len() {
-                if let Some(found) = self.advance_in_chunk() {
-                    return Ok(Some(found));
-                }
-                continue;
-            }
-            if self.ended {
-                return Ok(None);
-            }
-            let Some((opcode, len)) = self.record_head()? else { return Ok(None) };
-            self.chunk_offset = self.offset;
-            let whole = 9 + len;
-            match opcode {
-                op::DATA_END => {
-                    self.finish(whole)?;
-                    return Ok(None);
-                }
-                op::CHUNK if len <= MAX_CHUNK => {
-                    if !self.load(len)? {
-                        return Ok(None);
-                    }
-                    self.open_chunk(opcode, len);
-                }
-                op::SCHEMA | op::CHANNEL | op::MESSAGE | op::ATTACHMENT | op::METADATA | op::HEADER
-                    if len <= MAX_RECORD =>
-                {
-                    if !self.load(len)? {
-                        return Ok(None);
-                    }
-                    self.offset += whole;
-                    return Ok(Some((opcode, Place::Record)));
-                }
-                op::CHUNK | op::ATTACHMENT | op::METADATA | op::MESSAGE | op::SCHEMA | op::CHANNEL => {
-                    self.damage_of(self.offset, whole, "a record above the reader's limit");
-                    self.skip(len)?;
-                }
-                // Indexes and private records.
-                _ => self.skip(len)?,
-            }
-            self.offset += whole;
-        }
-    }
-
-    /// Opcode and length of the record at `offset`; `None`, and ended, when no whole record is there.
-    fn record_head(&mut self) -> Result<Option<(u8, u64)>, ReadError> {
-        let left = self.len - self.offset;
-        if left < 9 {
-            self.stop(
-                if left == 0 { "the file has no end yet" } else { "the file ends within a record" },
-                left,
-            );
-            return Ok(None);
-        }
-        let mut head = [0u8; 9];
-        if !self.read_into(&mut head)? {
-            return Ok(None);
-        }
-        self.offset -= 9;
-        let len =
-            u64::from_le_bytes([head[1], head[2], head[3], head[4], head[5], head[6], head[7], head[8]]);
-        let known = (1..=op::LAST).contains(&head[0]) || head[0] >= op::PRIVATE;
-        if !known {
-            self.stop("what follows is no MCAP record", left);
-            return Ok(None);
-        }
-        if len > left - 9 {
-            self.stop("the file ends within a record", left);
-            return Ok(None);
-        }
-        Ok(Some((head[0], len)))
-    }
-
-    fn advance_in_chunk(&mut self) -> Option<(u8, Place)> {
-        let rest = &self.chunk[self.chunk_at..];
-        let bounds = rest.first_chunk::<9>().and_then(|head| {
-            let len =
-                u64::from_le_bytes([head[1], head[2], head[3], head[4], head[5], head[6], head[7], head[8]]);
-            let len = usize::try_from(len).ok()?;
-            (len <= rest.len() - 9).then_some((head[0], len))
-        });
-        let Some((opcode, len)) = bounds else {
-            let bytes = rest.len() as u64;
-            self.chunk_at = self.chunk.len();
-            self.damage_of(self.chunk_offset, bytes, "a record that does not end within its chunk");
-            return None;
-        };
-        let from = self.chunk_at + 9;
-        self.chunk_at = from + len;
-        let wanted = matches!(opcode, op::MESSAGE | op::SCHEMA | op::CHANNEL);
-        wanted.then_some((opcode, Place::Chunk { from, to: from + len }))
-    }
-
-    /// Unpacks the chunk in `record`. A damaged one is left out.
-    fn open_chunk(&mut self, opcode: u8, len: u64) {
-        self.chunk.clear();
-        self.chunk_at = 0;
-        let unpacked = match chunk_head(&self.record) {
-            Some(head) if head.compression.is_empty() => self.copy_chunk(head.crc, head.records),
-            Some(head) if head.compression == "zstd" => self.unpack_chunk(opcode, len),
-            Some(head) => Err(format!(
-                "compression '{}' is not supported; convert the file with `mcap compress --compression zstd`",
-                head.compression
-            )),
-            None => Err("a chunk whose lengths do not fit".to_owned()),
-        };
-        if let Err(reason) = unpacked {
-            self.chunk.clear();
-            self.damage_of(self.offset, 9 + len, &reason);
-        }
-    }
-
-    fn copy_chunk(&mut self, crc: u32, records: (usize, usize)) -> Result<(), String> {
-        let records = self.record.get(records.0..records.1).unwrap_or_default();
-        if crc != 0 && crc32(records) != crc {
-            return Err("a chunk that fails its checksum".to_owned());
-        }
-        self.chunk.extend_from_slice(records);
-        Ok(())
-    }
-
-    /// Decompression is the mcap crate's: it is fed one whole chunk record at a time.
-    fn unpack_chunk(&mut self, opcode: u8, len: u64) -> Result<(), String> {
-        let mut decoder = self.decoder.take().unwrap_or_else(new_decoder);
-        let mut head = [opcode; 9];
-        head[1..].copy_from_slice(&len.to_le_bytes());
-        let mut rest: &[u8] = &self.record;
-        decoder.insert(9).copy_from_slice(&head);
-        decoder.notify_read(9);
-        loop {
-            match decoder.next_event() {
-                Some(Ok(LinearReadEvent::ReadRequest(wanted))) => {
-                    if rest.is_empty() {
-                        // It asks for the next record: the chunk is done. The decoder serves the next one too.
-                        self.decoder = Some(decoder);
-                        return Ok(());
-                    }
-                    let (now, later) = rest.split_at(wanted.clamp(1, rest.len()));
-                    decoder.insert(now.len())[..now.len()].copy_from_slice(now);
-                    decoder.notify_read(now.len());
-                    rest = later;
-                }
-                Some(Ok(LinearReadEvent::Record { data, opcode })) => {
-                    if self.chunk.len() + data.len() > MAX_CHUNK as usize {
-                        return Err("a chunk above the reader's limit".to_owned());
-                    }
-                    self.chunk.push(opcode);
-                    self.chunk.extend_from_slice(&(data.len() as u64).to_le_bytes());
-                    self.chunk.extend_from_slice(data);
-                }
-                Some(Err(error)) => return Err(format!("a damaged chunk: {error}")),
-                None => return Err("a damaged chunk".to_owned()),
-            }
-        }
     }
 
     fn message_at(&self, place: Place) -> Option<Message<'_>> {
@@ -379,7 +234,7 @@ impl Recording {
         if id == 0 || self.schemas.contains_key(&id) {
             return;
         }
-        self.schema_bytes += schema.data.len();
+        self.schema_bytes = self.schema_bytes.saturating_add(schema.data.len());
         if self.schema_bytes > MAX_SCHEMA_BYTES || self.schemas.len() >= MAX_CHANNELS {
             return self.damage("more schemas than the reader's limit");
         }
@@ -387,7 +242,8 @@ impl Recording {
     }
 
     fn channel(&mut self, place: Place) {
-        let mut bytes = Bytes(self.bytes(place));
+        let record = self.bytes(place);
+        let (mut bytes, len) = (Bytes(record), record.len());
         let parsed = (|| {
             let (id, schema_id) = (bytes.u16()?, bytes.u16()?);
             let (topic, message_encoding) = (bytes.string()?, bytes.string()?);
@@ -399,12 +255,13 @@ impl Recording {
         if self.channels.contains_key(&id) {
             return;
         }
-        if self.channels.len() >= MAX_CHANNELS {
+        self.channel_bytes = self.channel_bytes.saturating_add(len);
+        if self.channels.len() >= MAX_CHANNELS || self.channel_bytes > MAX_METADATA as usize {
             return self.damage("more channels than the reader's limit");
         }
         let (schema_name, schema_encoding, schema) = match self.schemas.get(&schema_id) {
             Some(s) => (s.name.clone(), s.encoding.clone(), s.data.clone()),
-            None if schema_id == 0 => Default::default(),
+            None if schema_id == 0 => (String::new(), String::new(), Arc::default()),
             None => return self.damage("a channel of an unknown schema"),
         };
         let kind = kind_of(&metadata, &message_encoding);
@@ -422,103 +279,16 @@ impl Recording {
         self.channels.insert(id, channel);
     }
 
-    fn follow_clock(&mut self, metadata: &Metadata) {
+    fn follow(&mut self, metadata: &Metadata) {
+        if metadata.name == META_RECORDING {
+            self.raw_checked = metadata.entries.get(RAW_KEY).is_some_and(|v| v == RAW_CRC32);
+        }
         if metadata.name == META_CLOCK
             && let Some(offset) = metadata.entries.get("utc_offset_ns").and_then(|v| v.parse().ok())
         {
             self.utc_offset_ns = offset;
         }
     }
-
-    /// Behind the data: whether index and end are there too.
-    fn finish(&mut self, data_end: u64) -> Result<(), ReadError> {
-        self.ended = true;
-        self.end.offset = self.offset + data_end;
-        let magic = mcap::MAGIC.len() as u64;
-        if self.len < self.end.offset + magic {
-            self.end.reason = Some("the file ends within its index".to_owned());
-            return Ok(());
-        }
-        self.seek(SeekFrom::Start(self.len - magic))?;
-        let mut last = [0u8; 8];
-        self.read_into(&mut last)?;
-        self.end.finished = last == *mcap::MAGIC;
-        if !self.end.finished {
-            self.end.reason = Some("the file ends within its index".to_owned());
-        }
-        Ok(())
-    }
-
-    fn stop(&mut self, reason: &str, unread: u64) {
-        self.ended = true;
-        self.end.offset = self.offset;
-        self.end.unread = unread;
-        self.end.reason = Some(reason.to_owned());
-    }
-
-    /// Something in the current record or chunk was left out.
-    fn damage(&mut self, reason: &str) {
-        self.damage_of(self.chunk_offset, 0, reason);
-    }
-
-    fn damage_of(&mut self, offset: u64, bytes: u64, reason: &str) {
-        self.end.damaged += 1;
-        self.end.damaged_bytes += bytes;
-        if self.end.damages.len() < MAX_DAMAGES {
-            self.end.damages.push(Damage { offset, bytes, reason: reason.to_owned() });
-        }
-    }
-
-    /// Reads the record behind its head; `len` was checked against file and limit. `false`, and ended, when the
-    /// file has become shorter meanwhile.
-    fn load(&mut self, len: u64) -> Result<bool, ReadError> {
-        let (at, mut record) = (self.offset, std::mem::take(&mut self.record));
-        record.resize(len as usize, 0);
-        if record.capacity() > 4 << 20 && record.len() < 1 << 20 {
-            record.shrink_to(1 << 20);
-        }
-        let read = self.read_into(&mut record);
-        self.record = record;
-        // The caller counts the whole record.
-        self.offset = at;
-        read
-    }
-
-    fn skip(&mut self, len: u64) -> Result<(), ReadError> {
-        let target = self.offset + 9 + len;
-        self.seek(SeekFrom::Start(target))
-    }
-
-    fn seek(&mut self, to: SeekFrom) -> Result<(), ReadError> {
-        let offset = self.offset;
-        self.file.seek(to).map_err(|source| ReadError::Io { path: self.path.clone(), offset, source })?;
-        Ok(())
-    }
-
-    /// Reads and counts; `false`, and ended, when the file has become shorter meanwhile.
-    fn read_into(&mut self, bytes: &mut [u8]) -> Result<bool, ReadError> {
-        match self.file.read_exact(bytes) {
-            Ok(()) => {
-                self.offset += bytes.len() as u64;
-                Ok(true)
-            }
-            Err(e) if e.kind() == io::ErrorKind::UnexpectedEof => {
-                self.stop("the file became shorter while it was read", 0);
-                Ok(false)
-            }
-            Err(source) => Err(ReadError::Io { path: self.path.clone(), offset: self.offset, source }),
-        }
-    }
-}
-
-fn new_decoder() -> LinearReader {
-    LinearReader::new_with_options(
-        LinearReaderOptions::default()
-            .with_skip_start_magic(true)
-            .with_skip_end_magic(true)
-            .with_prevalidate_chunk_crcs(true)
-            .with_record_length_limit(MAX_CHUNK as usize),
-    )
 }
 
 /// Iterator over the messages of a recording.

@@ -6,6 +6,7 @@ use crate::reader::MAX_CHUNK;
 use ipc_types::payload::{Encoding, Stamp};
 use ipc_types::topic::TopicKind;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 pub(crate) mod op {
     pub const HEADER: u8 = 0x01;
@@ -19,12 +20,26 @@ pub(crate) mod op {
     /// Last opcode that MCAP assigns; from 0x80 on they are private.
     pub const LAST: u8 = 0x0F;
     pub const PRIVATE: u8 = 0x80;
+    /// Ours: CRC-32 of everything from the end of the last chunk up to this record. Raw messages stand before it.
+    pub const RAW_CHECK: u8 = 0x80;
+}
+
+/// Bytes of a [`op::RAW_CHECK`] record.
+pub(crate) const RAW_CHECK_BYTES: usize = 9 + 4;
+
+/// A [`op::RAW_CHECK`] record.
+pub(crate) fn raw_check(crc: u32) -> [u8; RAW_CHECK_BYTES] {
+    let mut record = [0; RAW_CHECK_BYTES];
+    record[0] = op::RAW_CHECK;
+    record[1..9].copy_from_slice(&4u64.to_le_bytes());
+    record[9..].copy_from_slice(&crc.to_le_bytes());
+    record
 }
 
 pub(crate) struct Schema {
     pub(crate) name: String,
     pub(crate) encoding: String,
-    pub(crate) data: Vec<u8>,
+    pub(crate) data: Arc<[u8]>,
 }
 
 /// The topic kind that channel metadata names, if its payload is the one of this version.
@@ -86,6 +101,8 @@ pub(crate) struct ChunkHead<'a> {
     pub(crate) crc: u32,
     pub(crate) compression: &'a str,
     pub(crate) records: (usize, usize),
+    /// Bytes of the records, unpacked.
+    pub(crate) uncompressed: u64,
 }
 
 pub(crate) fn chunk_head(record: &[u8]) -> Option<ChunkHead<'_>> {
@@ -95,7 +112,7 @@ pub(crate) fn chunk_head(record: &[u8]) -> Option<ChunkHead<'_>> {
     let len = usize::try_from(bytes.u64()?).ok()?;
     let from = record.len() - bytes.0.len();
     let fits = len <= bytes.0.len() && uncompressed <= MAX_CHUNK;
-    fits.then(|| ChunkHead { crc, compression, records: (from, from + len) })
+    fits.then(|| ChunkHead { crc, compression, records: (from, from + len), uncompressed })
 }
 
 pub(crate) fn schema(record: &[u8]) -> Option<(u16, Schema)> {
@@ -103,7 +120,7 @@ pub(crate) fn schema(record: &[u8]) -> Option<(u16, Schema)> {
     let id = bytes.u16()?;
     let (name, encoding) = (bytes.string()?.to_owned(), bytes.string()?.to_owned());
     let len = bytes.u32()? as usize;
-    let data = bytes.take(len)?.to_vec();
+    let data = bytes.take(len)?.into();
     Some((id, Schema { name, encoding, data }))
 }
 
@@ -124,23 +141,71 @@ pub(crate) fn metadata(record: &[u8]) -> Option<Metadata> {
     Some(Metadata { name: bytes.string()?.to_owned(), entries: bytes.map()? })
 }
 
-/// CRC-32 of ISO-HDLC (zlib's), as MCAP uses it.
-pub(crate) fn crc32(bytes: &[u8]) -> u32 {
-    const TABLE: [u32; 256] = {
-        let mut table = [0u32; 256];
+/// CRC-32 of ISO-HDLC (zlib's), as MCAP uses it: bytes that come one piece after the other.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Crc(u32);
+
+/// `TABLES[0]` is the table of one byte; `TABLES[n]` that of a byte with `n` zeros behind it, so that eight bytes are taken
+/// at once.
+const TABLES: [[u32; 256]; 8] = {
+    let mut tables = [[0u32; 256]; 8];
+    let mut i = 0;
+    while i < 256 {
+        let (mut value, mut bit) = (i as u32, 0);
+        while bit < 8 {
+            value = if value & 1 == 1 { 0xEDB8_8320 ^ (value >> 1) } else { value >> 1 };
+            bit += 1;
+        }
+        tables[0][i] = value;
+        i += 1;
+    }
+    let mut n = 1;
+    while n < 8 {
         let mut i = 0;
         while i < 256 {
-            let (mut value, mut bit) = (i as u32, 0);
-            while bit < 8 {
-                value = if value & 1 == 1 { 0xEDB8_8320 ^ (value >> 1) } else { value >> 1 };
-                bit += 1;
-            }
-            table[i] = value;
+            let before = tables[n - 1][i];
+            tables[n][i] = (before >> 8) ^ tables[0][(before & 0xFF) as usize];
             i += 1;
         }
-        table
-    };
-    !bytes.iter().fold(!0u32, |crc, byte| TABLE[((crc ^ u32::from(*byte)) & 0xFF) as usize] ^ (crc >> 8))
+        n += 1;
+    }
+    tables
+};
+
+impl Crc {
+    pub(crate) fn new() -> Self {
+        Self(!0)
+    }
+
+    pub(crate) fn add(&mut self, bytes: &[u8]) {
+        let (eights, rest) = bytes.as_chunks::<8>();
+        for eight in eights {
+            let low = u32::from_le_bytes([eight[0], eight[1], eight[2], eight[3]]) ^ self.0;
+            let [a, b, c, d] = low.to_le_bytes();
+            self.0 = TABLES[7][usize::from(a)]
+                ^ TABLES[6][usize::from(b)]
+                ^ TABLES[5][usize::from(c)]
+                ^ TABLES[4][usize::from(d)]
+                ^ TABLES[3][usize::from(eight[4])]
+                ^ TABLES[2][usize::from(eight[5])]
+                ^ TABLES[1][usize::from(eight[6])]
+                ^ TABLES[0][usize::from(eight[7])];
+        }
+        for byte in rest {
+            self.0 = TABLES[0][((self.0 ^ u32::from(*byte)) & 0xFF) as usize] ^ (self.0 >> 8);
+        }
+    }
+
+    pub(crate) fn value(self) -> u32 {
+        !self.0
+    }
+}
+
+/// [`Crc`] of bytes that are all there.
+pub(crate) fn crc32(bytes: &[u8]) -> u32 {
+    let mut crc = Crc::new();
+    crc.add(bytes);
+    crc.value()
 }
 
 #[cfg(test)]
@@ -152,6 +217,7 @@ mod tests {
     fn the_checksum_is_zlibs() {
         assert_eq!(crc32(b"123456789"), 0xCBF4_3926);
         assert_eq!(crc32(b""), 0);
+        assert_eq!(crc32(b"The quick brown fox jumps over the lazy dog"), 0x414F_A339);
     }
 
     #[test]
@@ -169,6 +235,15 @@ mod tests {
     }
 
     proptest! {
+        #[test]
+        fn a_checksum_knows_no_pieces(bytes: Vec<u8>, at: prop::sample::Index) {
+            let (before, behind) = bytes.split_at(at.index(bytes.len() + 1));
+            let mut crc = Crc::new();
+            crc.add(before);
+            crc.add(behind);
+            prop_assert_eq!(crc.value(), crc32(&bytes));
+        }
+
         #[test]
         fn any_bytes_are_survived(bytes: Vec<u8>) {
             let _ = (chunk_head(&bytes).is_some(), schema(&bytes).is_some(), attachment(&bytes).is_some());

@@ -3,7 +3,7 @@
 //!
 //! It re-stimulates; whether a program behaves as it did is the verifier's question, which needs no rail.
 
-use crate::reader::{Item, ReadError, Recording};
+use crate::reader::{End, Item, ReadError, Recording};
 use ipc_types::event::{EventKind, Level};
 use ipc_types::payload::{CanFrame, HealthState, can_flag, from_bytes};
 use ipc_types::port::{Publisher, Subscriber};
@@ -147,6 +147,11 @@ impl Frames {
         Ok(Self { recording: Recording::open(path)?, source: source.to_owned(), echoes })
     }
 
+    /// How the recording ended, once there is no next frame: what of it could not be read is not played.
+    pub fn end(&self) -> &End {
+        self.recording.end()
+    }
+
     /// The next frame.
     pub fn next_frame(&mut self) -> Result<Option<CanFrame>, ReadError> {
         while let Some(item) = self.recording.next_item()? {
@@ -201,7 +206,7 @@ impl Pace {
 
 #[derive(Serialize)]
 struct Status<'a> {
-    file: &'a Path,
+    file: String,
     source: &'a str,
     frames: u64,
     rounds: u64,
@@ -340,10 +345,14 @@ impl Player {
     }
 
     fn over(&mut self) {
-        let message =
-            format!("replay of {} ended: {} frames of '{}'", self.path.display(), self.sent, self.source);
-        let detail = serde_json::json!({ "file": self.path, "source": self.source, "frames": self.sent });
-        self.ctx.event(EventKind::BusState, Level::Info, message, detail);
+        let end = self.frames.end();
+        let unread = end.damaged_bytes + end.unread;
+        let lost = if unread > 0 { format!("; {unread} bytes could not be read") } else { String::new() };
+        let (path, sent) = (self.path.display(), self.sent);
+        let message = format!("replay of {path} ended: {sent} frames of '{}'{lost}", self.source);
+        let detail = serde_json::json!({ "file": self.path.display().to_string(), "source": self.source, "frames": self.sent, "bytes_unread": unread });
+        let level = if unread > 0 { Level::Warning } else { Level::Info };
+        self.ctx.event(EventKind::BusState, level, message, detail);
         self.status();
     }
 
@@ -353,7 +362,7 @@ impl Player {
 
     fn status(&mut self) {
         let status = Status {
-            file: &self.path,
+            file: self.path.display().to_string(),
             source: &self.source,
             frames: self.sent,
             rounds: self.rounds,

@@ -6,6 +6,7 @@ use crate::disk;
 use crate::file::RecordingFile;
 use crate::format::META_SEALED;
 use crate::reader::{End, Item, ReadError, Recording};
+use crate::sync::sync_folder;
 use ipc_types::clock;
 use mcap::McapError;
 use mcap::records::MessageHeader;
@@ -23,6 +24,8 @@ pub struct Report {
     pub messages: u64,
     /// Bytes of data that could not be read.
     pub bytes_lost: u64,
+    /// Places that were left out or altered.
+    pub damaged: u64,
     /// The file was whole already and is as it was.
     pub already_sealed: bool,
     /// Why the old file ended early.
@@ -47,46 +50,63 @@ pub enum SealError {
     #[error("{0} is being written by a running recorder; it will finish the file itself")]
     InUse(PathBuf),
     #[error(
+        "{path} cannot be locked: {source}; whether a recorder writes it cannot be told, so copy it to a local file system \
+         and recover the copy"
+    )]
+    NoLock { path: PathBuf, source: io::Error },
+    #[error(
         "cannot write {path}: {source}; free space there (about the size of the recording) and try again"
     )]
     Write { path: PathBuf, source: io::Error },
 }
 
-/// Makes a recording whole, in its place. A file that is damaged in the middle is written anew without the
-/// damaged chunks; one that is whole is left alone.
+/// Makes a recording whole, in its place; of a link, in the place it leads to. A file that is damaged in the middle is
+/// written anew without the damaged chunks; one that is whole is left alone.
 pub fn recover(path: &Path) -> Result<Report, SealError> {
-    let open = |source| SealError::Read(ReadError::Open { path: path.to_owned(), source });
-    let guard = File::open(path).map_err(open)?;
-    if !disk::lock(&guard) {
-        return Err(SealError::InUse(path.to_owned()));
+    make_whole(path, false)
+}
+
+/// As [`recover`], of a file that a recorder knows to be nobody's: also where files cannot be locked.
+pub fn recover_own(path: &Path) -> Result<Report, SealError> {
+    make_whole(path, true)
+}
+
+fn make_whole(named: &Path, own: bool) -> Result<Report, SealError> {
+    let open = |source| SealError::Read(ReadError::Open { path: named.to_owned(), source });
+    let path = std::fs::canonicalize(named).map_err(open)?;
+    let (guard, lock) = disk::open_locked(&path).map_err(open)?;
+    match lock {
+        disk::Lock::InUse => return Err(SealError::InUse(named.to_owned())),
+        disk::Lock::Unknown(source) if !own => {
+            return Err(SealError::NoLock { path: named.to_owned(), source });
+        }
+        disk::Lock::Taken | disk::Lock::Unknown(_) => {}
     }
-    let mut recording = Recording::open(path)?;
-    if disk::is_finished(path) {
+    let mut recording = Recording::open(&path)?;
+    if disk::is_finished(&path) {
         let messages = count(&mut recording)?;
         let end = recording.end();
         if end.finished && end.damaged == 0 {
-            return Ok(Report { messages, bytes_lost: 0, already_sealed: true, reason: None });
+            return Ok(Report { messages, bytes_lost: 0, damaged: 0, already_sealed: true, reason: None });
         }
-        recording = Recording::open(path)?;
+        recording = Recording::open(&path)?;
     }
     let mut name = path.as_os_str().to_owned();
     name.push(".sealing");
     let copy = PathBuf::from(name);
     let failed = |source| SealError::Write { path: copy.clone(), source };
-    let file = OpenOptions::new().read(true).write(true).create(true).truncate(true).open(&copy);
-    let file = Arc::new(file.map_err(failed)?);
-    disk::lock(&file);
+    let file = Arc::new(create_copy(&copy).map_err(failed)?);
     let result = rewrite(&mut recording, &file).and_then(|report| {
+        // Who could read the recording can read it on.
+        let _ = guard.metadata().and_then(|meta| file.set_permissions(meta.permissions()));
         file.sync_all().map_err(RewriteError::Write)?;
-        std::fs::rename(&copy, path).map_err(RewriteError::Write)?;
+        std::fs::rename(&copy, &path).map_err(RewriteError::Write)?;
         Ok(report)
     });
     match result {
         Ok(report) => {
             // The new name is only on the medium when its folder is.
-            if let Some(folder) = path.parent().and_then(|p| File::open(p).ok()) {
-                let _ = folder.sync_all();
-            }
+            let _ = sync_folder(&path);
             Ok(report)
         }
         Err(error) => {
@@ -97,6 +117,25 @@ pub fn recover(path: &Path) -> Result<Report, SealError> {
             })
         }
     }
+}
+
+/// Creates the copy, locked. One that a killed sealing left is taken away before; a link is never followed.
+fn create_copy(path: &Path) -> io::Result<File> {
+    let create = || OpenOptions::new().read(true).write(true).create_new(true).open(path);
+    let file = match create() {
+        Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {
+            let is_file = std::fs::symlink_metadata(path)?.is_file();
+            let free = is_file && !matches!(disk::open_locked(path)?.1, disk::Lock::InUse);
+            if !free {
+                return Err(io::Error::new(e.kind(), "it is there and in use, or no file"));
+            }
+            std::fs::remove_file(path)?;
+            create()?
+        }
+        result => result?,
+    };
+    disk::lock(&file);
+    Ok(file)
 }
 
 fn count(recording: &mut Recording) -> Result<u64, ReadError> {
@@ -141,6 +180,7 @@ fn rewrite(recording: &mut Recording, file: &Arc<File>) -> Result<Report, Rewrit
     let report = Report {
         messages,
         bytes_lost: end.unread + end.damaged_bytes,
+        damaged: end.damaged,
         already_sealed: false,
         reason: reason(&end),
     };
@@ -148,6 +188,7 @@ fn rewrite(recording: &mut Recording, file: &Arc<File>) -> Result<Report, Rewrit
         ("utc_ns".to_owned(), clock::utc_ns().to_string()),
         ("messages".to_owned(), messages.to_string()),
         ("bytes_lost".to_owned(), report.bytes_lost.to_string()),
+        ("damaged".to_owned(), end.damaged.to_string()),
         ("reason".to_owned(), report.reason.clone().unwrap_or_default()),
     ]);
     out.metadata(META_SEALED, entries)?;

@@ -6,7 +6,7 @@ use crate::disk;
 use crate::format;
 use crate::writer::{Notice, Progress, Shared, ToWriter, Writer};
 use ipc_types::event::{EventKind, Level};
-use ipc_types::payload::{HealthState, Job};
+use ipc_types::payload::{Event, HealthState, Job, event_flag, from_bytes};
 use ipc_types::port::{Publisher, RawSubscriber, ReadCounters};
 use ipc_types::rail::RailError;
 use ipc_types::reactor::Reactor;
@@ -31,6 +31,9 @@ const CLOCK_JUMP_NS: u64 = 1_000_000;
 /// What `run` waits for the writer to finish the file when the stack ends.
 const FINISH_LIMIT: Duration = Duration::from_millis(900);
 
+/// What of it the topics may take to be emptied, when the disk is slow.
+const DRAIN_LIMIT: Duration = Duration::from_millis(400);
+
 /// Why the recorder ended.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
@@ -49,6 +52,15 @@ struct Source {
     port: Box<dyn RawSubscriber>,
     /// Largest message.
     max_message: usize,
+    /// Since when it hears, CLOCK_MONOTONIC.
+    since_ns: u64,
+    /// `stack/events`.
+    events: bool,
+}
+
+/// Whether an event was said before, when a recorder was not there.
+fn is_again(header: &[u8]) -> bool {
+    from_bytes::<Event>(header).is_some_and(|event| event.flags & event_flag::AGAIN != 0)
 }
 
 struct Recorder {
@@ -133,6 +145,8 @@ impl Recorder {
             sources.push(Source {
                 name: topic.name.clone(),
                 port: ctx.raw_subscriber(&topic.name)?,
+                since_ns: clock::mono_ns(),
+                events: topic.kind == TopicKind::Events,
                 max_message: topic.kind.header_bytes() + topic.max_tail as usize,
             });
         }
@@ -176,13 +190,13 @@ impl Recorder {
         Ok((recorder, writer, inbox))
     }
 
-    /// Takes what waits in the topics, until they are empty or no buffer is free.
-    fn look(&mut self) {
+    /// Takes what waits in the topics, until they are empty or no buffer is free; whether they are empty.
+    fn look(&mut self) -> bool {
         // Bounded: a flood must not keep the heartbeat waiting. What is left waits on the rail.
         for _ in 0..QUEUE {
             let Some(mut batch) = self.batch.take().or_else(|| self.shared.pool.take()) else {
                 self.stalls += 1;
-                return;
+                return false;
             };
             let (first, began_ns) = (batch.entries.len(), clock::mono_ns());
             let more = self.fill(&mut batch);
@@ -195,12 +209,13 @@ impl Recorder {
             let full = self.batch.as_ref().is_some_and(|b| b.is_full());
             if (full || aged) && !self.hand_over(first, began_ns) {
                 self.stalls += u64::from(full);
-                return;
+                return !more;
             }
             if !more {
-                return;
+                return true;
             }
         }
+        false
     }
 
     /// Fills a batch; `true` when it is full and topics may have more.
@@ -211,7 +226,12 @@ impl Recorder {
                 if room == 0 {
                     return true;
                 }
+                let (events, since_ns) = (source.events, source.since_ns);
                 let taken = source.port.drain_raw(room, &mut |stamp, header, tail| {
+                    // Said again for another recorder: this one was there.
+                    if events && is_again(header) && stamp.t_ns >= since_ns {
+                        return;
+                    }
                     // `room` made sure that it fits.
                     let _ = batch.push(i as u16, stamp, header, tail);
                 });
@@ -366,7 +386,11 @@ impl Recorder {
     /// Takes what is still there and lets the writer finish.
     fn stop(mut self, finished: &Receiver<()>) -> Result<(), RunError> {
         self.ctx.set_state(HealthState::Stopping);
-        self.look();
+        // Nobody writes any more, but the disk may be behind: what still waits on the rail goes with it.
+        let until = Instant::now() + DRAIN_LIMIT;
+        while !self.look() && Instant::now() < until {
+            std::thread::sleep(DRAIN_PERIOD);
+        }
         if let Some(batch) = self.batch.take() {
             self.send(batch);
         }

@@ -11,9 +11,17 @@ pub struct TempDir(PathBuf);
 
 impl TempDir {
     pub fn new(name: &str) -> Self {
+        Self::below(&std::env::temp_dir(), name)
+    }
+    /// In memory: for tests with many small files.
+    pub fn fast(name: &str) -> Self {
+        let shm = Path::new("/dev/shm");
+        if shm.is_dir() { Self::below(shm, name) } else { Self::new(name) }
+    }
+    fn below(parent: &Path, name: &str) -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let n = COUNT.fetch_add(1, Ordering::Relaxed);
-        let path = std::env::temp_dir().join(format!("dinrail-rec-{}-{name}-{n}", std::process::id()));
+        let path = parent.join(format!("dinrail-rec-{}-{name}-{n}", std::process::id()));
         std::fs::create_dir_all(&path).unwrap();
         Self(path)
     }

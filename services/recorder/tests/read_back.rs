@@ -102,8 +102,9 @@ fn a_file_is_read_while_it_is_written_and_after_it_was_cut_off() {
     let report = recover(&copy).unwrap();
     assert!(!report.already_sealed && report.bytes_lost > 0);
     let found = read_back(&python, &copy, &[]);
-    // 4000 frames and the eight, less the last one that was cut.
-    assert_eq!(found["statistics"], 4007);
-    assert_eq!(found["metadata"]["dinrail.sealed"][0]["messages"], "4007");
+    // 4000 frames and the eight, less those behind the last checksum that was not cut.
+    let kept = found["statistics"].as_u64().unwrap();
+    assert!((3960..4008).contains(&kept), "{kept}");
+    assert_eq!(found["metadata"]["dinrail.sealed"][0]["messages"], kept.to_string());
     rig.stop();
 }

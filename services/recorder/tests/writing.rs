@@ -370,3 +370,54 @@ fn a_moment_has_no_rate() {
     let cells: Vec<_> = line.split_whitespace().collect();
     assert_eq!((cells[1], cells[3]), ("2", "-"), "{line}");
 }
+
+#[test]
+fn a_file_that_is_deleted_while_it_is_written_is_told_and_another_begins() {
+    let dir = TempDir::new("deleted");
+    let mut rig = Rig::start(stack(dir.path()), Config::default());
+    rig.send(&[frame(1, clock::mono_ns())]);
+    rig.settle();
+    let first = rig.files().remove(0);
+    // With its folder.
+    std::fs::remove_dir_all(first.parent().unwrap()).unwrap();
+    wait_for("another file", || rig.progress().files == 2);
+    let notice = rig.notices.recv().unwrap();
+    let expected = format!("{} was deleted while it was written, with 1 messages", first.display());
+    assert!(notice.fault && notice.message.starts_with(&expected), "{}", notice.message);
+    rig.send(&[frame(2, clock::mono_ns())]);
+    assert!(rig.progress().paused.is_none());
+    let files = rig.stop();
+    assert_eq!(files.len(), 1);
+    assert_eq!(sequences(&files[0], "can0/rx"), [2]);
+    assert_ne!(files[0], first, "no number is given twice");
+}
+
+#[test]
+fn a_thousand_files_of_former_years_neither_delay_the_first_message_nor_stay_unfinished() {
+    let dir = TempDir::fast("years");
+    let stack = stack(dir.path());
+    let folder = dir.path().join("recordings");
+    std::fs::create_dir_all(&folder).unwrap();
+    // Two of them were cut off; one is no recording at all, one a link, one has no name that UTF-8 knows.
+    let mut old = mcap::MAGIC.to_vec();
+    for n in 1..=1000 {
+        let ended = if n % 400 == 0 { 1 } else { 2 };
+        std::fs::write(folder.join(disk::file_name("test", n * 1_000_000_000, n as u64)), old.repeat(ended))
+            .unwrap();
+    }
+    old.clear();
+    std::fs::write(folder.join(disk::file_name("test", 0, 1001)), "not MCAP").unwrap();
+    let strange = std::os::unix::ffi::OsStrExt::from_bytes(b"test-\xff.mcap");
+    std::fs::write(folder.join::<&std::ffi::OsStr>(strange), "strange").unwrap();
+    std::os::unix::fs::symlink("/nowhere", folder.join(disk::file_name("test", 0, 1002))).unwrap();
+    let mut rig =
+        Rig::start(stack, Config { max_size: Size(1 << 20), keep: Size(3 << 20), ..Config::default() });
+    rig.send(&[frame(1, clock::mono_ns())]);
+    wait_for("sealing", || rig.progress().sealed == 2);
+    let files = rig.stop();
+    let current = files.last().unwrap();
+    assert!(current.to_str().unwrap().ends_with("-1003.mcap"), "{current:?}");
+    assert_eq!(sequences(current, "can0/rx"), [1]);
+    assert_eq!(files.len(), 1002, "nothing was above the quota");
+    assert!(files.iter().all(|f| disk::is_finished(f) || f.to_str().unwrap().ends_with("-1001.mcap")));
+}

@@ -116,6 +116,13 @@ pub fn complete(port: BorrowedFd<'_>, c: &Character) -> io::Result<()> {
     Ok(tcsetattr(port, OptionalActions::Now, &t)?)
 }
 
+/// Has the kernel drop RTS and DTR when the port is closed, also by a process that was killed.
+pub fn drop_lines_on_close(port: BorrowedFd<'_>) -> io::Result<()> {
+    let mut t = tcgetattr(port)?;
+    t.control_modes |= ControlModes::HUPCL;
+    Ok(tcsetattr(port, OptionalActions::Now, &t)?)
+}
+
 /// Asks for marks before damaged bytes (PARMRK), see [`crate::protocol::parmrk`].
 pub fn mark_errors(port: BorrowedFd<'_>) -> io::Result<()> {
     let mut t = tcgetattr(port)?;
@@ -184,5 +191,6 @@ mod tests {
         let c = Character { baud: 9600, data_bits: 8, parity: Parity::None, stop_bits: 1, flow: Flow::None };
         assert!(make_pipe(pipe.as_fd(), &c).is_err() && complete(pipe.as_fd(), &c).is_err());
         assert!(mark_errors(pipe.as_fd()).is_err() && differences(pipe.as_fd(), &c).is_err());
+        assert!(drop_lines_on_close(pipe.as_fd()).is_err());
     }
 }

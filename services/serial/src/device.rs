@@ -225,6 +225,9 @@ mod tests {
         let t = tcgetattr(device.fd()).unwrap();
         assert_eq!((t.input_modes.bits() & INPUT, t.output_modes.bits() & libc::OPOST), (0, 0));
         assert_eq!(t.control_modes.bits() & (libc::CRTSCTS | libc::HUPCL), 0);
+        // Wanted again where RTS switches a transmitter.
+        character::drop_lines_on_close(device.fd()).unwrap();
+        assert_ne!(tcgetattr(device.fd()).unwrap().control_modes.bits() & libc::HUPCL, 0);
     }
 
     #[test]

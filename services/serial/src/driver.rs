@@ -10,6 +10,7 @@ use ipc_types::payload::{CHUNK_BYTES, SerialChunk, serial_flag};
 use serde::Serialize;
 
 use crate::port::{ErrorCounters, Port, Read};
+use crate::protocol::answer::Expected;
 use crate::protocol::echo::{Echo, EchoCounters};
 use crate::protocol::framer::{self, Chunk, FrameCounters, Framer};
 use crate::protocol::pacer::{self, Pacer};
@@ -254,6 +255,11 @@ impl Driver {
             echo.end_at(now_ns + self.echo_patience_ns);
         }
         let (head, bytes) = self.sender.current();
+        // Where nothing keeps the silence before the next transmission, waiting for the one behind the answer does.
+        let awaited = outcome.not_sent.is_none()
+            && head.flags & serial_flag::EXPECT_ANSWER != 0
+            && self.sender.keeps_silence();
+        self.framer.expect(if awaited { Expected::of(bytes) } else { None });
         let missing = if outcome.not_sent.is_some() { serial_flag::NOT_SENT } else { 0 };
         let header = SerialChunk {
             first_t_ns: outcome.first_ns,
@@ -380,5 +386,59 @@ mod tests {
             driver.is_idle().then_some(())
         });
         assert_eq!((echoes, driver.counters().tx.frames), (1, 1));
+    }
+
+    #[test]
+    fn an_awaited_answer_waits_for_no_silence_but_the_next_request_does() {
+        let frame = |bytes: &[u8]| [bytes, &crate::protocol::crc::crc16(bytes).to_le_bytes()].concat();
+        let (request, answer) = (frame(&[1, 3, 0, 0, 0, 1]), frame(&[1, 3, 2, 0, 7]));
+        for (flags, duplex, at_once) in [
+            (serial_flag::EXPECT_ANSWER, None, true),
+            (0, None, false),
+            (serial_flag::EXPECT_ANSWER, Some(crate::config::Duplex::Full), false),
+        ] {
+            let link = std::env::temp_dir().join(format!("dinrail-serial-await-{}", std::process::id()));
+            let made = Config::of_device(&format!("pty:{}", link.display()));
+            let mut other = Port::open(&made.options(Path::new("/")).unwrap()).unwrap();
+            let mut config = Config::of_device(link.to_str().unwrap());
+            config.duplex = duplex;
+            let port = Port::open(&config.options(Path::new("/")).unwrap()).unwrap();
+            assert!(other.visited());
+            let settings = config.settings(Kind::Pty);
+            let mut driver = Driver::new(port, &settings);
+            let (mut echoes, mut answers) = (0, 0);
+            let mut sink = |header: SerialChunk, bytes: &[u8], _: u64| {
+                if header.flags & serial_flag::TX_ECHO != 0 {
+                    echoes += 1;
+                } else {
+                    assert_eq!(bytes, answer);
+                    answers += 1;
+                }
+            };
+            let t = 1_000_000_000;
+            assert!(driver.load(Head { flags, ..Head::default() }, &request, t));
+            while !driver.is_idle() {
+                driver.turn(t, &mut sink).unwrap();
+            }
+            assert_eq!(other.write(&answer).unwrap(), answer.len());
+            ipc_types::testing::wait("the answer", || {
+                driver.readable(t, &mut sink).unwrap();
+                (driver.counters().rx.bytes == answer.len() as u64).then_some(())
+            });
+            assert_eq!(driver.counters().rx.frames, u64::from(at_once));
+            if duplex.is_some() {
+                continue;
+            }
+            assert!(driver.load(Head::default(), &request, t));
+            let silent = t + settings.framer.silence_ns;
+            for now in [t, silent - 1] {
+                driver.turn(now, &mut sink).unwrap();
+                assert_eq!(driver.counters().tx.frames, 1);
+            }
+            while !driver.is_idle() {
+                driver.turn(silent, &mut sink).unwrap();
+            }
+            assert_eq!((echoes, answers), (2, 1));
+        }
     }
 }

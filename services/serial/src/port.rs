@@ -339,7 +339,7 @@ impl Port {
         grown(now.overrun, before.overrun, serial_flag::OVERRUN, &mut errors.overrun);
         grown(now.buf_overrun, before.buf_overrun, serial_flag::OVERRUN, &mut errors.overrun);
         grown(now.brk, before.brk, serial_flag::BREAK, &mut errors.breaks);
-        flags
+        flags | unseen(flags, marked)
     }
 
     /// Writes what fits; 0 when nothing does. Into a pseudo-terminal that nobody has open bytes vanish, as on a line
@@ -389,6 +389,13 @@ impl Drop for Port {
             let _ = std::fs::remove_file(&made.link);
         }
     }
+}
+
+/// Marks of damage that the counters say nothing of: some adapters have counters and do not count. Which of parity and
+/// framing a mark means only the counters know.
+fn unseen(counted: u32, marked: u32) -> u32 {
+    let damaged = serial_flag::PARITY | serial_flag::FRAMING | serial_flag::BREAK;
+    if counted & damaged == 0 { marked & damaged } else { 0 }
 }
 
 fn hung_up(fd: BorrowedFd<'_>) -> bool {
@@ -460,6 +467,10 @@ fn prepare(port: &mut Port, shown: &str, options: &Options) -> Result<(), PortEr
             what: "switching RTS",
             source,
         })?;
+    }
+    if options.rts_on_send == Some(true) {
+        // Killed while it sends, this process would leave the transmitter on, and the line blocked for all.
+        let _ = character::drop_lines_on_close(port.fd());
     }
     if options.low_latency {
         let asked = sys::low_latency(port.fd());

@@ -154,3 +154,20 @@ fn sentences() {
     /dev/ttyUSB0 does not take 19200 5E1: data_bits read back otherwise; use settings that its chip has, or verify = false
     "#);
 }
+
+#[test]
+fn marks_count_where_the_counters_of_an_adapter_stand_still() {
+    use serial_flag::{BREAK, FRAMING, OVERRUN, PARITY};
+    for (counted, marked, more) in [
+        (0, 0, 0),
+        (0, PARITY, PARITY),
+        (0, PARITY | BREAK, PARITY | BREAK),
+        (OVERRUN, PARITY, PARITY),
+        // The counters know which it was.
+        (FRAMING, PARITY, 0),
+        (PARITY, PARITY, 0),
+        (BREAK, BREAK, 0),
+    ] {
+        assert_eq!(unseen(counted, marked), more, "{counted:x} {marked:x}");
+    }
+}

@@ -8,8 +8,8 @@ mod network;
 mod sdo;
 mod sync;
 
-use super::stack::{BenchStack, OWN_EXECUTABLE, PATIENCE};
-use super::{Bench, Report, What};
+use super::stack::{BenchStack, PATIENCE};
+use super::{Bench, What};
 use anyhow::{Context as _, bail, ensure};
 use dinrail_canopen::config::Simulation;
 use dinrail_canopen::service::fleet::Player;
@@ -20,7 +20,6 @@ use ipc_types::port::{Publisher, Subscriber};
 use ipc_types::{Context, topic::TopicKind};
 use serde_json::{Value, json};
 use std::path::Path;
-use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -35,24 +34,7 @@ const LOOK: Duration = Duration::from_millis(1);
 
 /// All parts, one after the other.
 pub fn run(bench: &mut Bench) -> anyhow::Result<()> {
-    for part in What::CANOPEN_PARTS {
-        let mut child = Command::new(OWN_EXECUTABLE);
-        child.args(["--json", "bench", part.name()]).stdin(Stdio::null()).stderr(Stdio::inherit());
-        if let Some(seconds) = bench.seconds {
-            child.args(["--seconds", &seconds.to_string()]);
-        }
-        let output = child.arg("--dir").arg(&bench.dir).output().context("starting a part of the bench")?;
-        ensure!(output.status.success(), "{} could not be run, {}; see above", part.name(), output.status);
-        let report: Report =
-            serde_json::from_slice(&output.stdout).context("reading the report of a part")?;
-        let own = |mut figure: super::Figure| {
-            bench.what.name().clone_into(&mut figure.bench);
-            figure
-        };
-        bench.figures.extend(report.figures.into_iter().map(own));
-        bench.notes.extend(report.notes);
-    }
-    Ok(())
+    bench.parts(&What::CANOPEN_PARTS)
 }
 
 /// A canopen-master of the stack, asked from here.

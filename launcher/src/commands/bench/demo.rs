@@ -45,7 +45,13 @@ fn change(text: &str, name: &str, changes: Changes) -> anyhow::Result<String> {
         }
         if changes.restarts {
             let rule = Table::from_iter(
-                [("max", Value::from(1000)), ("within", Value::from("1s"))].map(|(k, v)| (k.to_owned(), v)),
+                [
+                    ("max", Value::from(1000)),
+                    ("within", Value::from("1s")),
+                    ("backoff_first", Value::from("0ms")),
+                    ("backoff_max", Value::from("0ms")),
+                ]
+                .map(|(k, v)| (k.to_owned(), v)),
             );
             service.insert("restart".into(), rule.into());
         }

@@ -70,7 +70,10 @@ impl Client {
     fn answers(&mut self, requests: usize, count: u16) -> anyhow::Result<()> {
         let length = 9 + usize::from(count) * 2;
         self.answer.resize(requests * length, 0);
-        self.stream.read_exact(&mut self.answer).context("reading an answer")?;
+        // An exception is shorter than what is waited for.
+        let read = self.stream.read(&mut self.answer).context("reading an answer")?;
+        ensure!(read < 9 || self.answer[7] == 3, "unexpected answer {:02x?}", &self.answer[..read]);
+        self.stream.read_exact(&mut self.answer[read..]).context("reading an answer")?;
         let first = self.transaction.wrapping_sub(requests as u16 - 1);
         for (i, answer) in self.answer.chunks(length).enumerate() {
             let transaction = first.wrapping_add(i as u16).to_be_bytes();

@@ -15,7 +15,7 @@ use ipc_types::topic::TopicKind;
 use std::time::{Duration, Instant};
 
 const KILLS: u64 = 20;
-/// Longer than the `within` of the stack's restart rule, so that each restart is the first in a row.
+/// What the last restart stirred up has settled. The stack's restart rule has no back-off.
 const PAUSE: Duration = Duration::from_millis(1200);
 
 pub fn run(bench: &mut Bench) -> anyhow::Result<()> {

@@ -10,7 +10,7 @@
 //! have their size from the start; the queues' use is told apart, for the stack as a whole.
 
 use super::modbus::Client;
-use super::modbus_lines::Unit;
+use super::modbus_unit::Unit;
 use super::stack::{BenchStack, PATIENCE, free_port};
 use super::{Bench, Goal};
 use anyhow::{Context as _, bail, ensure};
@@ -347,7 +347,7 @@ pub fn run(bench: &mut Bench) -> anyhow::Result<()> {
         stack.check()?;
     }
     let seconds = began.elapsed().as_secs_f64();
-    let polls = unit.answered.load(Ordering::Relaxed);
+    let polls = unit.answered();
     drop((unit, line));
     let files = files_begun(&stack.dir().join("recordings")).saturating_sub(warm_files);
     tell(bench, &traffic, polls, seconds, files, &looks)?;

@@ -5,15 +5,22 @@ use clap::{Args, Subcommand, ValueEnum};
 use ipc_types::units::Span;
 use std::path::PathBuf;
 
+/// What a reader of the bus may not expect of frames that the stack's own driver sends.
+const OWN_FRAMES: &str = "These are frames of the stack: `can-io` inputs take them with `echo = true` only. Frames of another \
+    node (a client of `serve`, a `feed`, a device) reach them always.";
+
 #[derive(Debug, Subcommand)]
 pub enum CanCommand {
     /// Print frames as they are on the bus; several buses in order of time
     Dump(DumpArgs),
     /// Send frames and wait until they were on the bus
+    #[command(after_help = OWN_FRAMES)]
     Send(SendArgs),
     /// Make frames, as many and as fast as wanted
+    #[command(after_help = OWN_FRAMES)]
     Gen(GenArgs),
     /// Send a log or a recording to a bus, in its order and with its timing
+    #[command(after_help = OWN_FRAMES)]
     Replay(ReplayArgs),
     /// Rates of buses and identifiers, load, errors
     Stats(StatsArgs),

@@ -95,8 +95,8 @@ impl Flight {
 
     /// A frame of the stack was on the bus.
     ///
-    /// An echo does not tell which process sent it. So when order counts a frame is taken for ours only in its turn;
-    /// an equal one before that may be somebody else's and is remembered: see [`Self::accept_early`].
+    /// An echo does not tell for certain which process sent it. So when order counts a frame is taken for ours only in its
+    /// turn; an equal one before that may be somebody else's and is remembered: see [`Self::accept_early`].
     pub fn seen(&mut self, message: &CanFrame) -> Sight {
         let seen = to_frame(message);
         match self.waiting.iter().position(|w| w.frame == seen) {
@@ -116,6 +116,11 @@ impl Flight {
             }
             None => Sight::Other,
         }
+    }
+
+    /// A frame was on the bus that certainly another process of the stack sent.
+    pub fn seen_of_another(&mut self, message: &CanFrame) {
+        self.equal += u64::from(self.contents.contains(&content(&to_frame(message))));
     }
 
     /// Whether it is the turn of a frame that was seen, but earlier.
@@ -272,7 +277,7 @@ mod tests {
             for step in 0.. {
                 while next < frames.len() && flight.has_room(&frames[next]) {
                     flight.sent(&frames[next]);
-                    queue.push(&to_frame(&frames[next]), false, 0);
+                    queue.push(&to_frame(&frames[next]), false, 0, 0);
                     next += 1;
                 }
                 if queue.is_empty() {

@@ -26,6 +26,7 @@ mod stats;
 use crate::commands::UsageError;
 use crate::stackfile::nearest;
 use crate::supervise::client::{find, is_full, observe, with_room};
+use crate::terminal::coloured;
 use args::CanCommand;
 use dinrail_can::protocol::frame::Frame;
 use ipc_types::payload::CanFrame;
@@ -69,7 +70,7 @@ fn place<T>(stack: &Stack, open: impl FnMut() -> Result<T, RailError>) -> anyhow
 /// Prints; false when nobody reads any more. Not by ending the process: its place on the rail must be given back.
 fn put(text: &str) -> bool {
     let mut out = std::io::stdout().lock();
-    out.write_all(text.as_bytes()).and_then(|()| out.flush()).is_ok()
+    out.write_all(coloured(text).as_bytes()).and_then(|()| out.flush()).is_ok()
 }
 
 /// Every bus of the stack, in its order.

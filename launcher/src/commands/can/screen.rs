@@ -1,5 +1,6 @@
 //! A page that is drawn again and again in its place.
 
+use crate::terminal::coloured;
 use std::io::{Stdout, Write};
 
 /// The terminal's second screen; left when dropped, whatever happens.
@@ -24,7 +25,7 @@ impl Page {
             if i > 0 {
                 text.push_str("\r\n");
             }
-            text.push_str(line);
+            text.push_str(&coloured(line));
             text.push_str("\x1b[K");
         }
         if more > 0 {

@@ -42,6 +42,8 @@ pub struct Counts {
 /// See the module.
 pub struct Sender {
     bus: String,
+    /// Number of this process on the rail.
+    writer: u32,
     /// Services of the stack that may send on the bus, too.
     others: Vec<String>,
     rx: Subscriber<CanFrame>,
@@ -69,6 +71,7 @@ impl Sender {
         let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(1000));
         Ok(Self {
             bus: bus.to_owned(),
+            writer: ctx.writer,
             others,
             rx,
             tx,
@@ -117,8 +120,14 @@ impl Sender {
             self.rung = true;
         }
         let (flight, mut any) = (&mut self.flight, false);
+        let writer = self.writer;
         self.rx.drain(BATCH, |seen, _| {
-            if seen.flags & can_flag::TX_ECHO != 0 && flight.seen(seen) == Sight::Ours {
+            if seen.flags & can_flag::TX_ECHO == 0 {
+                return;
+            }
+            if seen.echo_of(writer) == Some(false) {
+                flight.seen_of_another(seen);
+            } else if flight.seen(seen) == Sight::Ours {
                 any = true;
                 each(seen);
             }
@@ -204,7 +213,7 @@ impl Sender {
                 others => format!("{} or another tool", others.join(", ")),
             };
             remarks.push(format!(
-                "bus '{}': {equal_from_others} frames equal to these came from another sender of the stack ({who}; echoes do not name their sender)",
+                "bus '{}': {equal_from_others} frames equal to these came from another sender of the stack ({who})",
                 self.bus
             ));
         }

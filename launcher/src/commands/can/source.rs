@@ -70,6 +70,9 @@ impl Source {
             path.display()
         );
         let mut file = BufReader::with_capacity(256 * 1024, file);
+        if let Some(way) = unpacked_by(file.fill_buf().map_err(cannot)?) {
+            anyhow::bail!("{} is compressed: unpack it first, with `{way} {0}`", path.display());
+        }
         let kind = if file.fill_buf().map_err(cannot)?.starts_with(MCAP_MAGIC) {
             let recording = Box::new(Recording::open(path)?);
             Kind::Recording {
@@ -120,6 +123,18 @@ impl Source {
             format!("{}: {bytes} bytes could not be read ({why})", self.path.display())
         })
     }
+}
+
+/// What unpacks a file that begins like this; `None` when it is not packed.
+fn unpacked_by(begin: &[u8]) -> Option<&'static str> {
+    const PACKED: [(&[u8], &str); 5] = [
+        (b"\x1f\x8b", "gunzip -k"),
+        (b"BZh", "bunzip2 -k"),
+        (b"\xfd7zXZ\0", "unxz -k"),
+        (b"\x28\xb5\x2f\xfd", "unzstd"),
+        (b"PK\x03\x04", "unzip"),
+    ];
+    PACKED.iter().find(|(magic, _)| begin.starts_with(magic)).map(|(_, way)| *way)
 }
 
 fn next_line(

@@ -1,6 +1,6 @@
 //! `dinrail canopen eds`: what is in an EDS or DCF, and what is wrong with it.
 
-use super::super::{println, table};
+use super::super::{error_text, println, table};
 use anyhow::Context as _;
 use dinrail_canopen::protocol::eds::{Eds, Severity};
 use serde_json::json;
@@ -20,9 +20,9 @@ pub fn check(files: &[PathBuf], as_json: bool) -> anyhow::Result<ExitCode> {
             Ok(eds) => eds,
             Err(e) => {
                 wrong = true;
-                eprintln!("dinrail: {e:#}");
+                eprintln!("dinrail: {}", error_text(&e));
                 if as_json {
-                    println(&json!({ "file": file, "error": format!("{e:#}") }).to_string());
+                    println(&json!({ "file": file, "error": error_text(&e) }).to_string());
                 }
                 continue;
             }

@@ -42,6 +42,21 @@ impl ValueType {
         })
     }
 
+    /// What a value of it looks like.
+    fn words(self) -> String {
+        match self {
+            Self::Int(n) => {
+                let most = 1i128 << (n * 16 - 1);
+                format!("whole numbers from {} to {}", -most, most - 1)
+            }
+            Self::Uint(n) => format!("whole numbers from 0 to {}", (1i128 << (n * 16)) - 1),
+            Self::Float(_) => "numbers like 1.5".to_owned(),
+            Self::Bit => "on or off, true or false, 1 or 0".to_owned(),
+            Self::Hex => "up to four hexadecimal digits".to_owned(),
+            Self::Text => "text".to_owned(),
+        }
+    }
+
     /// Registers of one value.
     pub fn registers(self) -> usize {
         match self {
@@ -150,11 +165,11 @@ fn parse(text: &str, form: &PointArgs, count: u16) -> Result<Point, UsageError> 
         return Err(usage(format!("'{text}': what is ':{more}'?")));
     }
     if !order.is_for(value_type.registers()) {
-        let registers = value_type.registers();
-        return Err(usage(format!(
-            "'{text}': order {} is not for values of {registers} registers",
-            order.name()
-        )));
+        let values = match value_type.registers() {
+            1 => "one register".to_owned(),
+            more => format!("{more} registers"),
+        };
+        return Err(usage(format!("'{text}': order {} is not for values of {values}", order.name())));
     }
     let point = Point { name, table, at, count, value_type, order };
     let most = if table.is_bits() { 2000 } else { 125 };
@@ -165,9 +180,7 @@ fn parse(text: &str, form: &PointArgs, count: u16) -> Result<Point, UsageError> 
             table.name()
         )));
     }
-    if usize::from(at) + entries > 65_536 {
-        return Err(usage(format!("'{text}': reaches behind address 65535")));
-    }
+    ends_in_table(text, &point, entries)?;
     Ok(point)
 }
 
@@ -193,14 +206,22 @@ fn parse_write(text: &str, form: &PointArgs) -> Result<(Point, Vec<Value>), Usag
     if point.value_type == ValueType::Text {
         let mut bytes = values.as_bytes().to_vec();
         bytes.resize(bytes.len().next_multiple_of(2), 0);
+        if !(2..=2 * 123).contains(&bytes.len()) {
+            return Err(usage(format!("'{text}': one request writes 1 to 246 characters")));
+        }
+        if point.order == Order::BA {
+            bytes.chunks_exact_mut(2).for_each(|c| c.swap(0, 1));
+        }
         out.extend(bytes.chunks(2).map(|c| json!(u16::from_be_bytes([c[0], c[1]]))));
         point.count = out.len() as u16;
+        ends_in_table(text, &point, out.len())?;
         return Ok((point, out));
     }
     let mut count = 0;
     for value in values.split(',') {
-        encode(value.trim(), &point, &mut out)
-            .ok_or_else(|| usage(format!("'{text}': {value} is no such value")))?;
+        encode(value.trim(), &point, &mut out).ok_or_else(|| {
+            usage(format!("'{text}': '{value}' is no value here: values are {}", point.value_type.words()))
+        })?;
         count += 1;
     }
     point.count = count;
@@ -208,7 +229,16 @@ fn parse_write(text: &str, form: &PointArgs) -> Result<(Point, Vec<Value>), Usag
     if out.len() > most {
         return Err(usage(format!("'{text}': one request writes up to {most} {}", point.table.name())));
     }
+    ends_in_table(text, &point, out.len())?;
     Ok((point, out))
+}
+
+/// Whether so many entries from the point on have addresses.
+fn ends_in_table(text: &str, point: &Point, entries: usize) -> Result<(), UsageError> {
+    if usize::from(point.at) + entries > 65_536 {
+        return Err(usage(format!("'{text}': reaches behind address 65535")));
+    }
+    Ok(())
 }
 
 /// A value as registers or bits.
@@ -243,7 +273,8 @@ fn encode(text: &str, point: &Point, out: &mut Vec<Value>) -> Option<()> {
         }
         ValueType::Float(_) => text.parse::<f64>().ok()?.to_le_bytes(),
         ValueType::Hex => {
-            u64::from(u16::from_str_radix(text.trim_start_matches("0x"), 16).ok()?).to_le_bytes()
+            let digits = text.strip_prefix("0x").or_else(|| text.strip_prefix("0X")).unwrap_or(text);
+            u64::from(u16::from_str_radix(digits, 16).ok()?).to_le_bytes()
         }
         ValueType::Text => return None,
     };
@@ -332,6 +363,7 @@ mod tests {
             "40000",
             "99999999",
             "0:float:AB",
+            "0:int16:DCBA",
             "00001:float",
             "0x1FFFF",
             "40001:int16:AB:z",
@@ -347,6 +379,7 @@ mod tests {
         '40000': entries count from 1
         '99999999': addresses end at 65535 (465536)
         '0:float:AB': order AB is not for values of 2 registers
+        '0:int16:DCBA': order DCBA is not for values of one register
         '00001:float': coils are bits
         '0x1FFFF': addresses end at 65535 (465536)
         '40001:int16:AB:z': what is ':z'?
@@ -375,8 +408,43 @@ mod tests {
         }
         let (point, bits) = parse_write("00003=on,off,1", &form()).unwrap();
         assert_eq!((point.at, bits), (2, vec![json!(true), json!(false), json!(true)]));
-        for text in ["40001", "30001=1", "40001=65536", "40001:int16=40000", "00001=2", "40001:float=x"] {
-            assert!(parse_write(text, &form()).is_err(), "{text}");
-        }
+        // A text with its characters exchanged, as it is read.
+        let (point, written) = parse_write("40001:string:BA=abc", &form()).unwrap();
+        assert_eq!(written, [json!(0x6261), json!(0x0063)]);
+        assert_eq!(decode(&point, &[0x6261, 0x0063]), [json!("abc")]);
+    }
+
+    #[test]
+    fn values_that_cannot_be_written() {
+        let long = format!("40001:string={}", "x".repeat(247));
+        let texts = [
+            "40001",
+            "30001=1",
+            "40001=65536",
+            "40001:int16=40000",
+            "40001=",
+            "00001=2",
+            "40001:float=x",
+            "40001:hex=12345",
+            "40001:string=",
+            &long,
+            "465536=1,2",
+            "465536:string=abc",
+        ];
+        let wrong: Vec<String> = texts.iter().map(|text| parse_write(text, &form()).unwrap_err().0).collect();
+        insta::assert_snapshot!(wrong.join("\n").replace(&"x".repeat(247), "..."), @r#"
+        '40001' is no assignment: write ADDRESS=VALUE, for example 40001=5
+        '30001=1': input_registers cannot be written
+        '40001=65536': '65536' is no value here: values are whole numbers from 0 to 65535
+        '40001:int16=40000': '40000' is no value here: values are whole numbers from -32768 to 32767
+        '40001=': '' is no value here: values are whole numbers from 0 to 65535
+        '00001=2': '2' is no value here: values are on or off, true or false, 1 or 0
+        '40001:float=x': 'x' is no value here: values are numbers like 1.5
+        '40001:hex=12345': '12345' is no value here: values are up to four hexadecimal digits
+        '40001:string=': one request writes 1 to 246 characters
+        '40001:string=...': one request writes 1 to 246 characters
+        '465536=1,2': reaches behind address 65535
+        '465536:string=abc': reaches behind address 65535
+        "#);
     }
 }

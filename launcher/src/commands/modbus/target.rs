@@ -11,7 +11,9 @@ use dinrail_modbus::protocol::mbap::{self, Scan};
 use dinrail_modbus::protocol::{ascii, rtu};
 use dinrail_serial::config::{Config as SerialConfig, Framing};
 use dinrail_serial::port::{Port, Read as PortRead};
+use ipc_types::stack::Severity;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::net::{RecvFlags, recv};
 use serde_json::Value;
 use std::io::{Read, Write};
 use std::net::{TcpStream, ToSocketAddrs};
@@ -47,6 +49,20 @@ enum Wire {
     Service { name: String, line: Box<JobLine> },
 }
 
+/// A request whose answer may still come, and until when. On Modbus TCP answers have numbers.
+struct Late {
+    unit: u8,
+    pdu: Vec<u8>,
+    until: Instant,
+}
+
+impl Late {
+    /// Whether its answer could be taken for the answer to this request.
+    fn confuses(&self, unit: u8, pdu: &[u8]) -> bool {
+        (self.unit, self.pdu.first()) == (unit, pdu.first()) && self.pdu != pdu
+    }
+}
+
 /// A master with its unit.
 pub struct Master {
     wire: Wire,
@@ -54,6 +70,7 @@ pub struct Master {
     unit: Value,
     timeout: Duration,
     retries: u8,
+    late: Option<Late>,
 }
 
 impl Master {
@@ -64,6 +81,9 @@ impl Master {
             Err(_) => Value::from(args.unit.clone()),
         };
         let timeout = args.timeout.duration();
+        if args.target.contains("://") && !unit.is_u64() {
+            return Err(UsageError(format!("unit '{}' is no number from 0 to 255", args.unit)).into());
+        }
         let wire = match args.target.split_once("://") {
             Some(("tcp", address)) => Wire::Tcp { stream: connect(address, 502, timeout)?, transaction: 0 },
             Some(("rtu-over-tcp", address)) => Wire::RtuOverTcp(connect(address, 502, timeout)?),
@@ -75,12 +95,10 @@ impl Master {
                 ))
                 .into());
             }
+            None if args.target.contains(['/', '.', ':']) => return Err(no_scheme(&args.target).into()),
             None => service(&args.target, args.stack.as_deref())?,
         };
-        if !matches!(wire, Wire::Service { .. }) && !unit.is_u64() {
-            return Err(UsageError(format!("unit '{}' is no number from 0 to 255", args.unit)).into());
-        }
-        Ok(Self { wire, target: args.target.clone(), unit, timeout, retries: args.retries })
+        Ok(Self { wire, target: args.target.clone(), unit, timeout, retries: args.retries, late: None })
     }
 
     /// One request, as [`Ask`] describes it.
@@ -104,8 +122,20 @@ impl Master {
         }
         let unit = unit.as_u64().unwrap_or(0) as u8;
         let mut last = Failed::NoAnswer("no answer".to_owned());
+        if let Some(late) = self.late.take_if(|late| late.confuses(unit, ask.pdu())) {
+            std::thread::sleep(late.until.saturating_duration_since(Instant::now()));
+        }
+        let numbered = matches!(self.wire, Wire::Tcp { .. });
+        let mut unanswered = false;
         for _ in 0..=self.retries {
-            match self.once(unit, ask.pdu()) {
+            let outcome = self.once(unit, ask.pdu());
+            unanswered |= matches!(outcome, Err(Failed::NoAnswer(_)));
+            if unanswered && !numbered {
+                // One of the tries may be answered behind the answer to the other.
+                let until = Instant::now() + self.timeout * 2;
+                self.late = Some(Late { unit, pdu: ask.pdu().to_vec(), until });
+            }
+            match outcome {
                 Ok(pdu) => {
                     return match fit(ask.pdu(), &pdu) {
                         Fit::Exception(code) => {
@@ -171,6 +201,9 @@ impl Master {
             Wire::RtuOverTcp(stream) => {
                 let mut frame = [0; rtu::MAX_ADU];
                 let len = rtu::encode(unit, pdu, &mut frame);
+                // What came unasked is no answer.
+                let mut some = [0_u8; 512];
+                while matches!(recv(&*stream, &mut some, RecvFlags::DONTWAIT), Ok((1.., _))) {}
                 stream.write_all(&frame[..len]).map_err(io)?;
                 if unit == 0 {
                     return Ok(Vec::new());
@@ -199,7 +232,7 @@ impl Master {
                     return Ok(Vec::new());
                 }
                 read_serial(port, timeout, |bytes| {
-                    if ascii { found_ascii(unit, bytes) } else { found_rtu(unit, pdu, bytes) }
+                    if ascii { found_ascii(unit, pdu, bytes) } else { found_rtu(unit, pdu, bytes) }
                 })
             }
             Wire::Service { .. } => Err(Failed::Other("a service takes jobs".to_owned())),
@@ -207,12 +240,39 @@ impl Master {
     }
 }
 
-fn connect(address: &str, port: u16, timeout: Duration) -> anyhow::Result<TcpStream> {
+/// A device or an address that stands there as it is; names of services have no such characters.
+fn no_scheme(target: &str) -> UsageError {
+    if target.contains('/') {
+        return UsageError(format!("write rtu://{target} or ascii://{target} for a serial device"));
+    }
+    UsageError(format!("write tcp://{target} for a device, or rtu-over-tcp://{target} for a converter"))
+}
+
+/// Host and port of an address, which may lack the port.
+fn host_and_port(address: &str, port: u16) -> Result<String, UsageError> {
     let address = address.trim_end_matches('/');
-    let whole = match address.rsplit_once(':') {
-        Some((_, digits)) if digits.parse::<u16>().is_ok() => address.to_owned(),
-        _ => format!("{address}:{port}"),
+    let (host, digits) = match address.rsplit_once(':') {
+        // The colon of an IPv6 address belongs to it.
+        Some((host, digits)) if !address.ends_with(']') && !host.ends_with(':') => (host, Some(digits)),
+        _ => (address, None),
     };
+    let whole_v6 = host.contains(':') && !host.starts_with('[');
+    let port = match digits {
+        Some(digits) if !whole_v6 => digits.parse::<u16>().ok().filter(|&port| port > 0),
+        _ => Some(port),
+    };
+    match port {
+        _ if host.is_empty() => {
+            Err(UsageError("the address lacks a host: write tcp://192.168.1.20".to_owned()))
+        }
+        None => Err(UsageError(format!("'{address}': a port is a number from 1 to 65535"))),
+        Some(port) if whole_v6 => Ok(format!("[{address}]:{port}")),
+        Some(port) => Ok(format!("{host}:{port}")),
+    }
+}
+
+fn connect(address: &str, port: u16, timeout: Duration) -> anyhow::Result<TcpStream> {
+    let whole = host_and_port(address, port)?;
     let mut last = None;
     for resolved in whole.to_socket_addrs().with_context(|| format!("'{whole}' is no address"))? {
         match TcpStream::connect_timeout(&resolved, timeout.max(Duration::from_millis(100))) {
@@ -249,6 +309,10 @@ fn serial(text: &str, ascii: bool) -> anyhow::Result<Wire> {
     let options = config
         .options(Path::new("."))
         .ok_or_else(|| UsageError(format!("'{device}' is no device: write rtu:///dev/ttyUSB0")))?;
+    let findings = config.findings("", Path::new("."));
+    if let Some(error) = findings.iter().find(|f| f.severity == Severity::Error) {
+        return Err(UsageError(format!("{}; {}", error.message, error.help)).into());
+    }
     let port = Port::open(&options)?;
     for note in port.notes() {
         eprintln!("dinrail: {note}");
@@ -382,13 +446,14 @@ fn found_rtu(unit: u8, request: &[u8], bytes: &[u8]) -> Option<Vec<u8>> {
     })
 }
 
-/// The answer of the unit in a stream of ASCII characters.
-fn found_ascii(unit: u8, bytes: &[u8]) -> Option<Vec<u8>> {
-    let end = bytes.iter().position(|&b| b == b'\n')? + 1;
-    let start = bytes[..end].iter().rposition(|&b| b == b':')?;
-    let mut out = [0; 256];
-    let (from, pdu) = ascii::decode(&bytes[start..end], &mut out).ok()?;
-    (from == unit).then(|| pdu.to_vec())
+/// The answer of the unit in a stream of ASCII characters, whatever stands before it.
+fn found_ascii(unit: u8, request: &[u8], bytes: &[u8]) -> Option<Vec<u8>> {
+    bytes.split_inclusive(|&b| b == b'\n').find_map(|line| {
+        let start = line.iter().rposition(|&b| b == b':')?;
+        let mut out = [0; 256];
+        let (from, pdu) = ascii::decode(&line[start..], &mut out).ok()?;
+        (from == unit && fit(request, pdu) != Fit::No).then(|| pdu.to_vec())
+    })
 }
 
 #[cfg(test)]
@@ -409,7 +474,86 @@ mod tests {
         let len = ascii::encode(5, &[3, 2, 0, 7], &mut frame);
         let mut bytes = b":05".to_vec();
         bytes.extend(&frame[..len]);
-        assert_eq!(found_ascii(5, &bytes), Some(vec![3, 2, 0, 7]));
-        assert_eq!(found_ascii(5, &bytes[..bytes.len() - 1]), None);
+        assert_eq!(found_ascii(5, &request, &bytes), Some(vec![3, 2, 0, 7]));
+        assert_eq!(found_ascii(5, &request, &bytes[..bytes.len() - 1]), None);
+        assert_eq!(found_ascii(6, &request, &bytes), None);
+        // Behind the end of somebody else's frame, a broken one, and an answer to something else.
+        for noise in ["0203FB\r\n", ":0203FB\r\n", ":05\r\n", ":058304ZZ\r\n", ":0503040000000 0F4\r\n"] {
+            let bytes = [noise.as_bytes(), &bytes].concat();
+            assert_eq!(found_ascii(5, &request, &bytes), Some(vec![3, 2, 0, 7]), "{noise}");
+        }
+    }
+
+    #[test]
+    fn addresses_of_the_command_line() {
+        for (text, whole) in [
+            ("10.0.0.1", "10.0.0.1:502"),
+            ("10.0.0.1:1502", "10.0.0.1:1502"),
+            ("plant/", "plant:502"),
+            ("[::1]", "[::1]:502"),
+            ("[::1]:1502", "[::1]:1502"),
+            ("::1", "[::1]:502"),
+            ("fe80::", "[fe80::]:502"),
+        ] {
+            assert_eq!(host_and_port(text, 502).unwrap(), whole, "{text}");
+        }
+        let wrong: Vec<String> = ["", ":502", "10.0.0.1:", "10.0.0.1:99999", "10.0.0.1:0", "plant:modbus"]
+            .iter()
+            .map(|text| host_and_port(text, 502).unwrap_err().0)
+            .chain(["127.0.0.1", "plant:502", "/dev/ttyUSB0"].map(|text| no_scheme(text).0))
+            .collect();
+        insta::assert_snapshot!(wrong.join("\n"), @r#"
+        the address lacks a host: write tcp://192.168.1.20
+        the address lacks a host: write tcp://192.168.1.20
+        '10.0.0.1:': a port is a number from 1 to 65535
+        '10.0.0.1:99999': a port is a number from 1 to 65535
+        '10.0.0.1:0': a port is a number from 1 to 65535
+        'plant:modbus': a port is a number from 1 to 65535
+        write tcp://127.0.0.1 for a device, or rtu-over-tcp://127.0.0.1 for a converter
+        write tcp://plant:502 for a device, or rtu-over-tcp://plant:502 for a converter
+        write rtu:///dev/ttyUSB0 or ascii:///dev/ttyUSB0 for a serial device
+        "#);
+    }
+
+    /// A unit behind a converter that answers each request after so long; registers show their address.
+    fn slow_unit(answers: u32, after: Duration) -> (String, std::thread::JoinHandle<()>) {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let target = format!("rtu-over-tcp://{}", listener.local_addr().unwrap());
+        let unit = std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            for _ in 0..answers {
+                let mut request = [0; 8];
+                if stream.read_exact(&mut request).is_err() {
+                    return;
+                }
+                std::thread::sleep(after);
+                let mut frame = [0; rtu::MAX_ADU];
+                let len = rtu::encode(request[0], &[3, 2, request[2], request[3]], &mut frame);
+                if stream.write_all(&frame[..len]).is_err() {
+                    return;
+                }
+            }
+        });
+        (target, unit)
+    }
+
+    #[test]
+    fn a_late_answer_is_not_the_next_one_s() {
+        // Slower than the timeout: the answer to the first try comes during the second, and that one's behind it.
+        let (target, unit) = slow_unit(4, Duration::from_millis(700));
+        let mut master = Master::open(&MasterArgs {
+            target,
+            unit: "5".to_owned(),
+            timeout: ipc_types::units::Span::from_ms(600),
+            retries: 1,
+            stack: None,
+        })
+        .unwrap();
+        let read = |at: u16| serde_json::json!({ "do": "read", "table": "holding_registers", "at": at });
+        for at in [0x0101, 0x0202] {
+            assert_eq!(master.try_ask(&read(at)).unwrap()["values"][0], at);
+        }
+        drop(master);
+        unit.join().unwrap();
     }
 }

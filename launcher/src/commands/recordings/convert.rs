@@ -3,7 +3,9 @@
 use crate::commands::UsageError;
 use crate::stackfile::nearest;
 use clap::{Args, ValueEnum};
+use dinrail_recorder::disk::{Lock, open_locked};
 use std::fs::File;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 /// A format of CAN logs.
@@ -99,23 +101,36 @@ pub fn renamed(asked: &[String], there: &[String]) -> anyhow::Result<Vec<(String
     Ok(names)
 }
 
-/// Creates the output. What is there is written over only when asked for, and never the input.
+/// Creates the output. What is there is written over only when asked for, and never the input, nor what is in use.
 pub fn create(path: &Path, input: &Path, force: bool) -> anyhow::Result<File> {
-    let same = std::fs::canonicalize(path).is_ok_and(|p| std::fs::canonicalize(input).is_ok_and(|i| i == p));
-    anyhow::ensure!(!same, "{} is the input itself: name another output", path.display());
-    let mut options = File::options();
-    options.read(true).write(true);
-    let opened = if force {
-        options.create(true).truncate(true).open(path)
-    } else {
-        options.create_new(true).open(path)
-    };
-    opened.map_err(|e| match e.kind() {
+    let cannot = |e: std::io::Error| match e.kind() {
         std::io::ErrorKind::AlreadyExists => {
             anyhow::anyhow!("{} is there already: name another output, or give --force", path.display())
         }
         _ => anyhow::anyhow!("cannot write {}: {e}", path.display()),
-    })
+    };
+    // The same file may have two names.
+    let identity = |meta: std::fs::Metadata| (meta.dev(), meta.ino());
+    let there = std::fs::metadata(path).ok().map(identity);
+    let same = there.is_some() && there == std::fs::metadata(input).ok().map(identity);
+    anyhow::ensure!(!same, "{} is the input itself: name another output", path.display());
+    let mut options = File::options();
+    options.read(true).write(true);
+    if !force {
+        return options.create_new(true).open(path).map_err(cannot);
+    }
+    let file = options.create(true).truncate(false).open(path).map_err(cannot)?;
+    let in_use = matches!(open_locked(path), Ok((_, Lock::InUse)));
+    anyhow::ensure!(
+        !in_use,
+        "{} is being written by a running recorder: name another output",
+        path.display()
+    );
+    // Pipes and terminals have no length.
+    if file.metadata().map_err(cannot)?.is_file() {
+        file.set_len(0).map_err(cannot)?;
+    }
+    Ok(file)
 }
 
 #[cfg(test)]
@@ -156,5 +171,29 @@ mod tests {
             "no frame of 'c' in the file (did you mean 'a'?); it has frames of a"
         );
         assert_eq!(names(&["a b"], &["a"]), "--bus 'a b': a bus has a name of letters, digits, _ and -");
+    }
+
+    #[test]
+    fn the_input_and_a_file_in_use_are_never_written_over() {
+        let dir = std::env::temp_dir().join(format!("dinrail-convert-{}", std::process::id()));
+        std::fs::create_dir_all(&dir).unwrap();
+        let (input, link, other) = (dir.join("in.log"), dir.join("link.log"), dir.join("other.mcap"));
+        std::fs::write(&input, "in").unwrap();
+        std::fs::hard_link(&input, &link).unwrap();
+        std::fs::write(&other, "old").unwrap();
+        for path in [&input, &link] {
+            let said = create(path, &input, true).unwrap_err().to_string();
+            assert!(said.contains("is the input itself"), "{said}");
+        }
+        assert!(create(&other, &input, false).unwrap_err().to_string().contains("give --force"));
+        let (held, lock) = open_locked(&other).unwrap();
+        assert!(matches!(lock, Lock::Taken));
+        let said = create(&other, &input, true).unwrap_err().to_string();
+        assert!(said.contains("is being written by a running recorder"), "{said}");
+        assert_eq!(std::fs::read(&other).unwrap(), b"old");
+        drop(held);
+        create(&other, &input, true).unwrap();
+        assert_eq!(std::fs::read(&other).unwrap(), b"");
+        std::fs::remove_dir_all(&dir).unwrap();
     }
 }

@@ -101,7 +101,10 @@ pub fn run(args: &ExportArgs, json: bool) -> anyhow::Result<ExitCode> {
     };
     if let Some(path) = &args.output {
         if json {
-            println(&serde_json::json!({ "file": path, "frames": frames, "buses": buses }).to_string());
+            println(
+                &serde_json::json!({ "file": path.display().to_string(), "frames": frames, "buses": buses })
+                    .to_string(),
+            );
         } else {
             println(&format!("{}: {frames} frames of {}", path.display(), buses.join(", ")));
         }

@@ -32,7 +32,7 @@ pub fn run(args: &ImportArgs, json: bool) -> anyhow::Result<ExitCode> {
     let frames = result.with_context(|| format!("writing {}", args.output.display()))?;
     let buses: Vec<&str> = names.iter().map(|(_, to)| to.as_str()).collect();
     if json {
-        println(&serde_json::json!({ "file": args.output, "frames": frames, "buses": buses }).to_string());
+        println(&serde_json::json!({ "file": args.output.display().to_string(), "frames": frames, "buses": buses }).to_string());
     } else {
         println(&format!("{}: {frames} frames of {}", args.output.display(), buses.join(", ")));
     }

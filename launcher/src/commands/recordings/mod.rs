@@ -6,6 +6,7 @@ mod import;
 
 use super::{DATA_LOSS, println};
 use crate::cli::RecordingsCommand;
+use crate::terminal::Guarded;
 use anyhow::Context as _;
 use dinrail_recorder::{CatError, Filter, Format, cat, info, recover};
 use std::io::BufWriter;
@@ -37,7 +38,7 @@ pub fn run(command: RecordingsCommand, json: bool) -> anyhow::Result<ExitCode> {
 
 /// Exit code 3 when the recording has places that could not be read.
 fn print(file: &Path, filter: &Filter, format: Format) -> anyhow::Result<ExitCode> {
-    let mut out = BufWriter::new(std::io::stdout().lock());
+    let mut out = BufWriter::new(Guarded::stdout());
     match cat(file, filter, format, &mut out) {
         Ok(printed) if printed.end.damaged > 0 || printed.end.unread > 0 => {
             let end = &printed.end;
@@ -58,9 +59,9 @@ fn make_whole(files: &[PathBuf], json: bool) -> anyhow::Result<ExitCode> {
     let mut lost = false;
     for file in files {
         let report = recover(file).with_context(|| file.display().to_string())?;
-        lost |= report.bytes_lost > 0;
+        lost |= report.bytes_lost > 0 || report.damaged > 0;
         if json {
-            println(&serde_json::json!({ "file": file, "report": report }).to_string());
+            println(&serde_json::json!({ "file": file.display().to_string(), "report": report }).to_string());
         } else {
             println(&format!("{}: {report}", file.display()));
         }

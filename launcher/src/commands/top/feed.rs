@@ -1,14 +1,17 @@
 //! What is known of a running stack, gathered once a refresh: rows of the control socket, statuses, images and
 //! events of the rail. Reads only topics that replace the oldest message, so it disturbs nobody.
 
-use crate::supervise::client::{Client, ClientError, observe};
+use crate::supervise::client::{Client, ClientError, observe, with_room};
 use crate::supervise::control::{LogLine, Reply, Request, ServiceRow, StackStatus};
 use crate::supervise::state_dir::RunningStack;
 use crate::supervise::watch;
+use dinrail_iec::Addressing;
+use dinrail_modbus::service::addressing_of;
+use dinrail_plc::program::address_text;
 use ipc_types::Context;
 use ipc_types::clock;
 use ipc_types::event::EventBody;
-use ipc_types::payload::{Event, Image, PlcState, Status};
+use ipc_types::payload::{Event, Image, PlcState, Status, event_flag};
 use ipc_types::port::Subscriber;
 use ipc_types::rail::RailError;
 use ipc_types::topic::{EVENTS, TopicKind};
@@ -86,8 +89,14 @@ pub enum FeedError {
 
 struct Plc {
     name: String,
-    port: Subscriber<Image>,
+    addressing: Addressing,
     points: Vec<(String, ImageRange)>,
+}
+
+/// The image of a plc.
+struct Camera {
+    plc: Plc,
+    port: Subscriber<Image>,
     shot: Option<Shot>,
 }
 
@@ -95,7 +104,7 @@ struct Plc {
 pub struct Feed {
     // Before the context: ports go before their node.
     statuses: Vec<(String, Subscriber<Status>, Option<Told>)>,
-    plcs: Vec<Plc>,
+    plcs: Vec<Camera>,
     events: Subscriber<Event>,
     pub ctx: Context,
     client: Client,
@@ -111,16 +120,19 @@ impl Feed {
         for service in &described.services {
             let status = TopicKind::Status.of(&service.name);
             if described.topic(&status).is_some() {
-                statuses.push((service.name.clone(), ctx.subscriber(&status)?, None));
+                let port = with_room(&stack.root, || ctx.subscriber(&status))?;
+                statuses.push((service.name.clone(), port, None));
             }
             let image = TopicKind::Image.of(&service.name);
             if described.topic(&image).is_some() {
-                let port = ctx.subscriber(&image)?;
+                let port = with_room(&stack.root, || ctx.subscriber(&image))?;
                 let points = points_of(&described, &service.name);
-                plcs.push(Plc { name: service.name.clone(), port, points, shot: None });
+                let plc =
+                    Plc { name: service.name.clone(), addressing: addressing_of(Some(service)), points };
+                plcs.push(Camera { plc, port, shot: None });
             }
         }
-        let events = ctx.subscriber(EVENTS)?;
+        let events = with_room(&stack.root, || ctx.subscriber(EVENTS))?;
         Ok(Self { statuses, plcs, events, ctx, client })
     }
 
@@ -139,8 +151,10 @@ impl Feed {
         };
         self.listen();
         let mut events = Vec::new();
-        self.events.drain(EVENTS_MAX, |_, tail| {
-            if let Ok(body) = serde_json::from_slice::<EventBody>(tail) {
+        self.events.drain(EVENTS_MAX, |event, tail| {
+            if event.flags & event_flag::AGAIN == 0
+                && let Ok(body) = serde_json::from_slice::<EventBody>(tail)
+            {
                 events.push(body);
             }
         });
@@ -168,11 +182,9 @@ impl Feed {
                 });
             });
         }
-        for plc in &mut self.plcs {
-            let (name, points) = (&plc.name, &plc.points);
-            let shot = &mut plc.shot;
-            plc.port.newest(|image, tail| {
-                *shot = shoot(name, points, image, tail).or(shot.take());
+        for Camera { plc, port, shot } in &mut self.plcs {
+            port.newest(|image, tail| {
+                *shot = shoot(plc, image, tail).or(shot.take());
             });
         }
     }
@@ -216,17 +228,19 @@ fn points_of(stack: &ipc_types::Stack, plc: &str) -> Vec<(String, ImageRange)> {
         .collect()
 }
 
-fn shoot(plc: &str, points: &[(String, ImageRange)], image: &Image, tail: &[u8]) -> Option<Shot> {
+fn shoot(plc: &Plc, image: &Image, tail: &[u8]) -> Option<Shot> {
+    let addressing = plc.addressing;
     let (input, output, marker) = image.areas(tail)?;
     let used = |area: &[u8]| {
         let end = area.iter().rposition(|b| *b != 0).map_or(0, |last| last + 1);
         area[..end].to_vec()
     };
-    let points = points
+    let points = plc
+        .points
         .iter()
         .filter_map(|(service, range)| {
             Some(Point {
-                address: watch::address(range),
+                address: address_text(range, addressing).unwrap_or_else(|_| watch::address(range)),
                 symbol: range.symbol.clone(),
                 type_name: range.type_name.clone().unwrap_or_default(),
                 service: service.clone(),
@@ -236,7 +250,7 @@ fn shoot(plc: &str, points: &[(String, ImageRange)], image: &Image, tail: &[u8])
         .collect();
     let areas = [(Area::Input, input), (Area::Output, output), (Area::Marker, marker)];
     Some(Shot {
-        plc: plc.to_owned(),
+        plc: plc.name.clone(),
         state: image.plc_state(),
         scan: image.scan,
         points,

@@ -1,10 +1,12 @@
 //! `dinrail top`: a running stack, live on the terminal.
 //!
 //! [`feed`] gathers, [`model`] decides, [`draw`] shows; this file is the loop and the terminal. Whatever happens,
-//! the terminal is left as it was found: by the normal end, an error, a panic and a signal.
+//! the terminal is left as it was found: by the normal end, an error, a panic and a signal. [`guard`] sees to it that
+//! nothing outlives its terminal.
 
 mod draw;
 pub mod feed;
+mod guard;
 mod image;
 mod model;
 mod sections;
@@ -16,23 +18,23 @@ use crate::supervise::control::{Reply, Request};
 use crate::supervise::state_dir::{self, RunningStack};
 use anyhow::Context as _;
 use feed::Feed;
+use guard::Guard;
 use ipc_types::reactor::signals;
 use model::{Key, Model, View, Wish};
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 use std::io::IsTerminal;
-use std::os::fd::OwnedFd;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant};
 
-/// Keys and signals are looked for at least this often.
+/// The guard is asked at least this often.
 const LOOK: Duration = Duration::from_millis(100);
 /// Shortest and longest time between two refreshes.
 const EVERY: (Duration, Duration) = (Duration::from_millis(100), Duration::from_mins(1));
 /// The launcher answers a restart within 15 s.
 const RESTART_LIMIT: Duration = Duration::from_secs(20);
 
-/// Shows a stack until `q`, Ctrl-C or SIGTERM.
+/// Shows a stack until `q`, Ctrl-C, SIGTERM, SIGHUP or the end of the terminal.
 pub fn run(stack: Option<&str>, every: Duration) -> anyhow::Result<()> {
     if !std::io::stdout().is_terminal() || !std::io::stdin().is_terminal() {
         anyhow::bail!("`dinrail top` needs a terminal; `dinrail status --json` tells a program the same");
@@ -41,7 +43,7 @@ pub fn run(stack: Option<&str>, every: Duration) -> anyhow::Result<()> {
         return Err(super::UsageError("--every takes 100ms to 60s".to_owned()).into());
     }
     // Before any thread exists: a signal must end the loop, not the process, or the terminal stays raw.
-    let signal = signals::descriptor(&[libc::SIGTERM, libc::SIGINT, libc::SIGHUP])?;
+    let guard = Guard::start(signals::descriptor(&[libc::SIGTERM, libc::SIGINT, libc::SIGHUP])?)?;
     let stack = find(stack)?;
     let feed = Feed::open(&stack)?;
     let model = Model::new(&stack.stack);
@@ -49,9 +51,10 @@ pub fn run(stack: Option<&str>, every: Duration) -> anyhow::Result<()> {
     let terminal = ratatui::try_init().context("preparing the terminal")?;
     let (done, results) = channel();
     let mut screen = Screen { terminal, model, feed: Some(feed), stack, every, done, results };
-    let ended = screen.work(&signal);
+    let ended = screen.work(&guard);
     let restored = ratatui::try_restore().context("restoring the terminal");
-    ended.and(restored)
+    // What fails on a terminal that is gone is nobody's error.
+    if guard.asked() { Ok(()) } else { ended.and(restored) }
 }
 
 struct Screen {
@@ -67,9 +70,9 @@ struct Screen {
 }
 
 impl Screen {
-    fn work(&mut self, signal: &OwnedFd) -> anyhow::Result<()> {
+    fn work(&mut self, guard: &Guard) -> anyhow::Result<()> {
         let mut due = Instant::now();
-        loop {
+        while !guard.asked() {
             let now = Instant::now();
             if now >= due {
                 due = now + self.every;
@@ -81,17 +84,17 @@ impl Screen {
             let model = &self.model;
             self.terminal.draw(|frame| draw::draw(model, frame))?;
             let wait = due.saturating_duration_since(Instant::now()).min(LOOK);
-            let mut pending = event::poll(wait)?;
-            while pending {
+            // Not left to the reader of keys: on a terminal that is gone it never comes back.
+            if !guard::wait_for_keys(wait) {
+                return Ok(());
+            }
+            while event::poll(Duration::ZERO)? {
                 if self.react(&event::read()?) {
                     return Ok(());
                 }
-                pending = event::poll(Duration::ZERO)?;
-            }
-            if signals::take(signal).is_some() {
-                return Ok(());
             }
         }
+        Ok(())
     }
 
     fn refresh(&mut self) {

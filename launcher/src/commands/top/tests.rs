@@ -26,6 +26,8 @@ pub fn row(service: &str, kind: &str) -> ServiceRow {
         uptime_ms: 185_000,
         cpu_percent: 1.25,
         rss_bytes: 5 << 20,
+        deaths: 0,
+        unstable: false,
     }
 }
 
@@ -110,6 +112,7 @@ pub fn snapshot(second: u64) -> Snapshot {
             services: 6,
             ready: 4,
             held: vec![],
+            unstable: vec![],
             failed: None,
         }),
         rows,

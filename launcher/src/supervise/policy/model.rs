@@ -14,14 +14,24 @@ pub enum Exhausted {
     FailStack,
 }
 
+/// A service that was ready for so long without a break is healthy, and what it did before is forgotten.
+pub const HEALTHY_NS: u64 = 60_000_000_000;
+/// A service that died so often since it was last healthy is told to be unstable, and again at each doubling.
+pub const UNSTABLE_AFTER: u32 = 5;
+
 /// How one service is supervised.
+///
+/// Two things use up the budget: more than `max` restarts within `within_ns`, and more than `max` starts in a row that
+/// never got ready, however long each of them took: one that hangs in its start for 10 s has no five restarts in 10 s.
+/// Who dies more seldom than that is started again for ever, with a delay that grows until it was healthy
+/// ([`HEALTHY_NS`], or `within_ns` if that is longer), and is told to be unstable.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Rule {
     /// So many restarts...
     pub max: u32,
-    /// ... within this time; a run that was ready for so long counts as healthy and resets the budget.
+    /// ... within this time.
     pub within_ns: u64,
-    /// Delay of the second restart in a row; doubles up to `backoff_max_ns`. The first one has no delay.
+    /// Delay of the second restart since it was healthy; doubles up to `backoff_max_ns`. The first one has no delay.
     pub backoff_first_ns: u64,
     pub backoff_max_ns: u64,
     pub on_exhausted: Exhausted,
@@ -114,7 +124,9 @@ pub enum Phase {
         kill_at: u64,
     },
     /// SIGKILL was sent because it hangs.
-    Killed,
+    Killed {
+        overdue_at: u64,
+    },
     /// SIGTERM was sent by `restart`.
     Restarting {
         kill_at: u64,
@@ -133,6 +145,10 @@ pub enum Phase {
     Stopping {
         kill_at: u64,
     },
+    /// SIGKILL was sent by the end of the stack, which waits for it no longer than until then.
+    Leaving {
+        until: u64,
+    },
     Ended,
 }
 
@@ -144,9 +160,10 @@ impl Phase {
             Self::Starting
                 | Self::Running
                 | Self::Aborting { .. }
-                | Self::Killed
+                | Self::Killed { .. }
                 | Self::Restarting { .. }
                 | Self::Stopping { .. }
+                | Self::Leaving { .. }
         )
     }
 
@@ -156,11 +173,11 @@ impl Phase {
             Self::Idle => "idle",
             Self::Starting => "starting",
             Self::Running => "running",
-            Self::Aborting { .. } | Self::Killed => "hung",
+            Self::Aborting { .. } | Self::Killed { .. } => "hung",
             Self::Restarting { .. } | Self::Cleaning { .. } => "restarting",
             Self::Waiting { .. } => "back-off",
             Self::Held => "held",
-            Self::Stopping { .. } => "stopping",
+            Self::Stopping { .. } | Self::Leaving { .. } => "stopping",
             Self::Ended => "ended",
         }
     }
@@ -182,6 +199,47 @@ pub struct Slot {
     pub(super) silent_from: u64,
     /// Times of unplanned restarts within the budget's window.
     pub(super) recent: VecDeque<u64>,
-    /// Failures since the last healthy run.
+    /// Deaths since it was last healthy.
     pub(super) row: u32,
+    /// Starts in a row that ended before they were ready.
+    pub(super) unready: u32,
+}
+
+impl Slot {
+    pub(super) fn new(name: String, rule: Rule) -> Self {
+        Self {
+            name,
+            rule,
+            phase: Phase::Idle,
+            generation: 0,
+            since: 0,
+            ready_at: 0,
+            silent_from: 0,
+            recent: VecDeque::new(),
+            row: 0,
+            unready: 0,
+        }
+    }
+
+    /// Unplanned deaths since it was last healthy, or started by hand.
+    pub fn deaths(&self) -> u32 {
+        self.row
+    }
+
+    /// It dies again and again, too seldom to be held for it.
+    pub fn unstable(&self) -> bool {
+        self.row >= UNSTABLE_AFTER
+    }
+
+    /// It has been ready for long enough that its next death is a first one.
+    pub(super) fn is_healthy(&self, now: u64) -> bool {
+        self.ready_at > 0 && now.saturating_sub(self.ready_at) >= HEALTHY_NS.max(self.rule.within_ns)
+    }
+
+    /// A fresh budget.
+    pub(super) fn forgive(&mut self) {
+        self.row = 0;
+        self.unready = 0;
+        self.recent.clear();
+    }
 }

@@ -20,7 +20,7 @@ const CLEAN_LIMIT_NS: u64 = 2_000_000_000;
 /// Log lines in a `died` event, bytes of each, and of all.
 const EPITAPH_LINES: usize = 20;
 const EPITAPH_BYTES: usize = 256;
-const EPITAPH_TOTAL_BYTES: usize = 4096;
+const EPITAPH_TOTAL_BYTES: usize = 2048;
 
 impl Supervisor {
     pub(super) fn spawn(&mut self, service: usize, generation: u32) {
@@ -168,7 +168,7 @@ impl Supervisor {
         if let Some(notify) = &self.notify {
             match notice.kind {
                 EventKind::Stopping => notify.send("STOPPING=1\nSTATUS=stopping"),
-                EventKind::StackFailed | EventKind::Held => {
+                EventKind::StackFailed | EventKind::Held | EventKind::Unstable => {
                     notify.send(&format!("STATUS={name}: {}", notice.message.replace('\n', " ")));
                 }
                 _ => {}

@@ -17,6 +17,44 @@ pub(super) struct Waiter {
 }
 
 impl Supervisor {
+    pub(super) fn take_clients(&mut self) {
+        let accepted = self.control.accept();
+        for id in accepted.ids {
+            let Some(fd) = self.control.client_fd(id) else { continue };
+            match self.reactor.add(fd) {
+                Ok(wake) => drop(self.sources.insert(wake, Source::Client(id))),
+                Err(_) => self.control.drop_client(id),
+            }
+        }
+        let why = match accepted.stuck {
+            Some(cause) => {
+                // It stays readable: waiting for it now would only turn the loop.
+                if let Some(wake) = self.control_wake.take() {
+                    let _ = self.reactor.remove(self.control.fd());
+                    self.sources.remove(&wake);
+                }
+                format!("no client can be taken: {cause}")
+            }
+            None if accepted.turned_away > 0 => {
+                "clients are turned away: the launcher has no file descriptor left (ulimit -n)".to_owned()
+            }
+            None => return,
+        };
+        if self.turned_away.failed(clock::mono_ns()).is_some() {
+            self.console.err(format!("stack      | == {why}"));
+        }
+    }
+
+    /// Once a tick: the control socket is waited for again after nobody could be taken.
+    pub(super) fn listen_again(&mut self) {
+        if self.control_wake.is_none()
+            && let Ok(wake) = self.reactor.add(self.control.fd())
+        {
+            self.sources.insert(wake, Source::Control);
+            self.control_wake = Some(wake);
+        }
+    }
+
     pub(super) fn serve(&mut self, id: u64, request: Result<Request, String>) {
         let now = clock::mono_ns();
         match request {
@@ -31,7 +69,10 @@ impl Supervisor {
             }
             Ok(Request::Down {}) => {
                 self.reply(id, &Reply::Stopping { pid: std::process::id() });
-                self.policy.stop("`down` was asked for", now);
+                // Asked twice by whomever, it is still one orderly end; signals may hurry it.
+                if !self.policy.stopping() {
+                    self.policy.stop("`down` was asked for", now);
+                }
             }
             Ok(Request::Logs { service, lines, follow }) => {
                 self.serve_logs(id, service.as_deref(), lines, follow);
@@ -98,6 +139,8 @@ impl Supervisor {
             uptime_ms: if pid == 0 { 0 } else { (now - slot.since) / MS },
             cpu_percent: if pid == 0 { 0.0 } else { service.cpu_percent },
             rss_bytes: child::usage(pid).map_or(0, |u| u.rss_bytes),
+            deaths: slot.deaths(),
+            unstable: slot.unstable(),
         }
     }
 
@@ -108,11 +151,13 @@ impl Supervisor {
 
     fn status(&self, now: u64) -> StackStatus {
         let held = self.held();
+        let unstable = self.policy.slots().iter().filter(|s| s.unstable()).map(|s| s.name.clone());
+        let unstable: Vec<String> = unstable.filter(|name| !held.contains(name)).collect();
         let ready = self.policy.slots().iter().filter(|s| s.phase == Phase::Running).count();
         let state = match () {
             () if self.policy.failed().is_some() => "failed",
             () if self.policy.stopping() => "stopping",
-            () if !held.is_empty() => "degraded",
+            () if !held.is_empty() || !unstable.is_empty() => "degraded",
             () if ready == self.services.len() => "running",
             () if self.all_ready => "degraded",
             () => "starting",
@@ -126,6 +171,7 @@ impl Supervisor {
             services: self.services.len() as u32,
             ready: ready as u32,
             held,
+            unstable,
             failed: self.policy.failed().map(str::to_owned),
         }
     }

@@ -21,7 +21,8 @@ pub struct WireCounters {
     pub received: u64,
     /// Error frames.
     pub errors: u64,
-    /// Frames of this side dropped because they had waited for longer than [`STALE_NS`] when the wire came back.
+    /// Frames of this side dropped because they had waited for longer than [`STALE_NS`] when the wire came back, or
+    /// because newer ones of the same client came while it took nothing for so long.
     pub stale: u64,
     /// Frames of this side that the wire took and lost: refused by the adapter, or it went down.
     pub lost: u64,
@@ -43,7 +44,35 @@ pub(super) struct WireSide {
     limit: usize,
     up: bool,
     stale_before_ns: u64,
+    /// When it took a frame last, or came up.
+    moved_ns: u64,
+    /// Since when a client (or the feed) cannot queue any more.
+    full_since_ns: Option<u64>,
+    /// Both last for longer than [`STALE_NS`].
+    held: bool,
     counters: WireCounters,
+}
+
+/// The time at which the wire counts as held is rounded up to this, so that a busy one moves no clock at each frame.
+const HELD_GRID_NS: u64 = 100_000_000;
+
+impl WireSide {
+    /// It has taken nothing for so long that what waits is stale.
+    pub(super) fn is_held(&self) -> bool {
+        self.held
+    }
+
+    /// Whether the oldest frame of a full queue goes for a new one; counts it then.
+    pub(super) fn sheds(&mut self) -> bool {
+        self.counters.stale += u64::from(self.held);
+        self.held
+    }
+
+    fn moves(&mut self, now_ns: u64) {
+        self.moved_ns = now_ns;
+        self.full_since_ns = None;
+        self.held = false;
+    }
 }
 
 /// Same frame as sent; drivers set ESI themselves.
@@ -61,6 +90,9 @@ impl VirtualBus {
             limit,
             up: false,
             stale_before_ns: 0,
+            moved_ns: 0,
+            full_since_ns: None,
+            held: false,
             counters: WireCounters::default(),
         });
     }
@@ -74,6 +106,7 @@ impl VirtualBus {
     pub fn wire_up(&mut self, now_ns: u64) {
         if let Some(wire) = &mut self.wire {
             wire.up = true;
+            wire.moves(now_ns);
             wire.stale_before_ns = now_ns.saturating_sub(STALE_NS);
         }
     }
@@ -110,6 +143,7 @@ impl VirtualBus {
             } else if arrived_ns < wire.stale_before_ns {
                 wire.counters.stale += 1;
             } else {
+                wire.moves(now_ns);
                 wire.flight.push_back(Flight { frame, origin, sent_ns: now_ns, suspect: false });
                 return Some(frame);
             }
@@ -123,7 +157,7 @@ impl VirtualBus {
         wire.counters.sent += 1;
         let place = wire.flight.iter().position(|f| same(&f.frame, frame));
         // Not on our list: given up before. It is ours all the same.
-        let origin = place.and_then(|i| wire.flight.remove(i)).map_or(Origin::Rail, |f| f.origin);
+        let origin = place.and_then(|i| wire.flight.remove(i)).map_or(Origin::Rail(0), |f| f.origin);
         self.on_bus(frame, origin, t_ns, tap);
     }
 
@@ -179,6 +213,34 @@ impl VirtualBus {
         wire.flight.retain(|f| !f.suspect || f.sent_ns + SUSPECT_NS > now_ns);
         wire.counters.lost += (before - wire.flight.len()) as u64;
         wire.flight.iter().map(|f| f.sent_ns).min()
+    }
+
+    /// Finds out whether the wire holds up its clients for too long. Returns when to look again.
+    pub(super) fn wire_holds(&mut self, now_ns: u64) -> Option<u64> {
+        let wire = self.wire.as_mut()?;
+        if wire.held {
+            return None;
+        }
+        let mut full = 0;
+        if self.connected > 0 {
+            for (number, client) in self.clients.iter().enumerate() {
+                let is_full = client.as_ref().is_some_and(|c| c.waiting.len() >= CLIENT_QUEUE);
+                full |= u32::from(is_full) << number;
+            }
+        }
+        if full == 0 && !self.feed_refused {
+            wire.full_since_ns = None;
+            return None;
+        }
+        let since_ns = wire.moved_ns.max(*wire.full_since_ns.get_or_insert(now_ns));
+        let due_ns = (since_ns + STALE_NS).next_multiple_of(HELD_GRID_NS);
+        if now_ns < due_ns {
+            return Some(due_ns);
+        }
+        wire.held = true;
+        self.room_again |= full;
+        self.feed_room_again |= std::mem::take(&mut self.feed_refused);
+        None
     }
 
     /// A client is gone: what it has on its way belongs to nobody.

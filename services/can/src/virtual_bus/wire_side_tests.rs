@@ -31,7 +31,7 @@ fn bus(up: bool) -> VirtualBus {
 }
 
 fn push(bus: &mut VirtualBus, text: &str, now_ns: u64) {
-    assert_eq!(bus.push_rail(&parse(text).unwrap(), false, now_ns), Pushed::Queued);
+    assert_eq!(bus.push_rail(&parse(text).unwrap(), false, now_ns, 0), Pushed::Queued);
 }
 
 fn next(bus: &mut VirtualBus, now_ns: u64) -> Option<String> {
@@ -59,10 +59,10 @@ fn three_on_their_way_and_the_rest_in_order_of_arbitration() {
     assert_eq!(
         seen,
         [
-            ("200#02", Origin::Rail),
+            ("200#02", Origin::Rail(0)),
             ("7FF#", Origin::Wire),
             ("20000080#0000000000000000", Origin::Wire),
-            ("300#01", Origin::Rail)
+            ("300#01", Origin::Rail(0))
         ]
     );
     let counters = bus.wire_counters().unwrap();
@@ -109,7 +109,7 @@ fn nobody_acknowledges() {
     assert_eq!(bus.wire_counters().unwrap().lost, 2);
     // One comes after all: it was on the wire and is ours.
     bus.wire_echo(&parse("100#01").unwrap(), 9 * SECOND, &mut seen);
-    assert_eq!(seen.0, [("100#01".to_owned(), Origin::Rail)]);
+    assert_eq!(seen.0, [("100#01".to_owned(), Origin::Rail(0))]);
 }
 
 #[test]
@@ -152,4 +152,82 @@ fn room_in_a_full_queue_is_told_once() {
     assert!(bus.take_rail_room_again() && !bus.take_rail_room_again());
     assert!(next(&mut bus, 2).is_some());
     assert!(!bus.take_rail_room_again(), "it was not full any more");
+}
+
+/// Frames of a client in SLCAN, `count` of them, numbered from `first`.
+fn flood(
+    bus: &mut VirtualBus,
+    client: usize,
+    first: usize,
+    count: usize,
+    now_ns: u64,
+) -> (usize, Option<Stopped>) {
+    let text: String = (first..first + count).map(|n| format!("t1232{n:04X}\r")).collect();
+    let (mut rest, mut seen) = (text.as_bytes(), Seen::default());
+    loop {
+        let taken = bus.take(client, rest, now_ns, &mut seen);
+        rest = &rest[taken.used..];
+        if taken.stopped != Some(Stopped::Turn) {
+            return (count - rest.iter().filter(|b| **b == b'\r').count(), taken.stopped);
+        }
+    }
+}
+
+#[test]
+fn a_wire_that_is_down_for_long_holds_no_client_in_its_place() {
+    for stuck in [false, true] {
+        // Down, or up without anybody who acknowledges.
+        let mut bus = bus(stuck);
+        let client = bus.connect(Dialect::Slcan).unwrap();
+        bus.take(client, b"O\r", SECOND, &mut Seen::default());
+        if stuck {
+            assert_eq!(flood(&mut bus, client, 0, 3, SECOND), (3, None));
+            assert_eq!(std::iter::from_fn(|| next(&mut bus, SECOND)).count(), 3);
+        }
+        let (taken, stopped) = flood(&mut bus, client, 1, 1000, SECOND);
+        assert_eq!(stopped, Some(Stopped::QueueFull), "for a short while nothing is lost");
+        assert_eq!(taken, CLIENT_QUEUE);
+        bus.take_room_again();
+        let due = bus.run(SECOND, &mut Seen::default()).unwrap();
+        assert!((STALE_NS..STALE_NS + 2 * HELD_GRID_NS).contains(&(due - SECOND)), "{due}");
+        assert_eq!(bus.run(due - 1, &mut Seen::default()), Some(due));
+        assert_eq!(bus.take_room_again(), 0);
+        assert_eq!(bus.run(due, &mut Seen::default()), None);
+        assert_eq!(bus.take_room_again(), 1 << client, "its socket is read again");
+        assert_eq!(flood(&mut bus, client, taken + 1, 1000 - taken, due), (1000 - taken, None));
+        let stale = bus.wire_counters().unwrap().stale;
+        assert_eq!(stale as usize, 1000 - taken, "the oldest, one by one");
+        // The newest are what the wire gets.
+        let later = due + SECOND;
+        if stuck {
+            bus.wire_flush();
+        }
+        bus.wire_up(later);
+        let first = next(&mut bus, later).unwrap();
+        assert_eq!(first, format!("123#{:04X}", 1001 - CLIENT_QUEUE));
+        // And now it is waited for again.
+        assert_eq!(flood(&mut bus, client, 0, 10, later), (1, Some(Stopped::QueueFull)));
+    }
+}
+
+#[test]
+fn a_feed_on_a_wire_that_is_down_waits_for_no_clock_and_goes_on_in_time() {
+    let mut bus = bus(false);
+    let frame = |n: usize| parse(&format!("123#{n:04X}")).unwrap();
+    assert!((0..CLIENT_QUEUE).all(|n| bus.push_feed(&frame(n), SECOND)));
+    assert_eq!(bus.run(SECOND, &mut Seen::default()), None);
+    assert!(!bus.push_feed(&frame(CLIENT_QUEUE), SECOND));
+    let due = bus.run(SECOND, &mut Seen::default()).unwrap();
+    assert!(due - SECOND >= STALE_NS && !bus.take_feed_room_again());
+    assert_eq!(bus.run(due, &mut Seen::default()), None);
+    assert!(bus.take_feed_room_again());
+    assert!((CLIENT_QUEUE..5000).all(|n| bus.push_feed(&frame(n), due)));
+    bus.wire_up(due);
+    assert_eq!(next(&mut bus, due), Some(format!("123#{:04X}", 5000 - CLIENT_QUEUE)));
+    // Full again, and the wire takes one: the feed is told.
+    bus.wire_down();
+    assert!(bus.push_feed(&frame(1), due) && !bus.push_feed(&frame(2), due));
+    bus.wire_up(due);
+    assert!(!bus.take_feed_room_again());
+    assert!(next(&mut bus, due).is_some() && bus.take_feed_room_again());
 }

@@ -74,7 +74,7 @@ fn what_a_peer_that_reads_nothing_was_not_given_has_no_echo() {
             talk.port.ready(Interest::WRITABLE).await.unwrap();
             hub.turn(|bus, _, now_ns| {
                 while bus.rail_room() > 0 {
-                    bus.push_rail(&frame, false, now_ns);
+                    bus.push_rail(&frame, false, now_ns, 0);
                 }
             });
             talk.settle().unwrap();
@@ -84,7 +84,7 @@ fn what_a_peer_that_reads_nothing_was_not_given_has_no_echo() {
         assert!(waiting <= 2 * WRITE_BYTES);
         hub.turn(|bus, _, now_ns| {
             while bus.rail_room() > 0 {
-                bus.push_rail(&frame, false, now_ns);
+                bus.push_rail(&frame, false, now_ns, 0);
             }
         });
         for _ in 0..10 {

@@ -117,7 +117,7 @@ fn an_adapter_without_a_word_of_acknowledgement() {
     with_wire(&settings(100, &[]), |wire, _, ears| {
         let old = clock::mono_ns() - 5_000_000_000;
         wire.line.hub.look(|bus, _| {
-            bus.push_rail(&parse("123#01").unwrap(), false, clock::mono_ns());
+            bus.push_rail(&parse("123#01").unwrap(), false, clock::mono_ns(), 0);
             bus.wire_next(old, |_| true).unwrap();
         });
         wire.watch_acknowledgements();
@@ -184,7 +184,7 @@ fn bus_off_is_met_by_a_restart_with_back_off() {
 fn own_frames_outside_of_the_filters_need_no_echo() {
     with_wire(&settings(100, &["100:700"]), |wire, far, ears| {
         for text in ["210#01", "123#02", "211#03"] {
-            wire.line.hub.look(|bus, _| bus.push_rail(&parse(text).unwrap(), false, clock::mono_ns()));
+            wire.line.hub.look(|bus, _| bus.push_rail(&parse(text).unwrap(), false, clock::mono_ns(), 0));
         }
         assert!(matches!(wire.exchange(), End::No));
         let mut bytes = [0; 80];
@@ -196,7 +196,7 @@ fn own_frames_outside_of_the_filters_need_no_echo() {
 }
 
 fn push(wire: &Wire<'_, Ears>, text: &str, since_ns: u64) {
-    wire.line.hub.look(|bus, _| bus.push_rail(&parse(text).unwrap(), false, since_ns));
+    wire.line.hub.look(|bus, _| bus.push_rail(&parse(text).unwrap(), false, since_ns, 0));
 }
 
 fn arrived(far: &UnixDatagram) -> Vec<String> {

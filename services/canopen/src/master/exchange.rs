@@ -514,7 +514,8 @@ impl Exchange {
             }
             let data = Self::build(&self.latched, &tx.pdo);
             let acyclic = tx.pdo.transmission == transmission::ACYCLIC;
-            if !turn || (acyclic && !tx.first && data == tx.sent) {
+            // What finds no room is not sent: an acyclic one goes behind the next SYNC, a cyclic one comes again.
+            if !turn || (acyclic && !tx.first && data == tx.sent) || out.is_full() {
                 continue;
             }
             (tx.sent, tx.first, tx.inhibit_until_ns) = (data, false, now_ns);
@@ -544,7 +545,8 @@ impl Exchange {
             }
             let data = Self::build(&self.outputs, pdo);
             let due = tx.event_at_ns.is_some_and(|at_ns| now_ns >= at_ns);
-            if (!tx.first && data == tx.sent && !due) || now_ns < tx.inhibit_until_ns {
+            // What finds no room stays due, and the caller is asked to come again at once.
+            if (!tx.first && data == tx.sent && !due) || now_ns < tx.inhibit_until_ns || out.is_full() {
                 continue;
             }
             (tx.sent, tx.first) = (data, false);

@@ -22,7 +22,7 @@ use super::transfers::{Owner, Transfers};
 use crate::protocol::cob_id::predefined;
 use crate::protocol::io::Outbox;
 use crate::protocol::nmt::NmtCommand;
-use command::{MAX_COMMANDS, state_after};
+use command::MAX_COMMANDS;
 use ipc_types::payload::CanFrame;
 use std::collections::VecDeque;
 
@@ -167,6 +167,8 @@ impl Network {
             (self.settings.boot_time_ns > 0).then(|| now_ns.saturating_add(self.settings.boot_time_ns));
         for node in &mut self.nodes {
             if node.settings.boot {
+                // The answer to a question of before would be taken for one to the first question.
+                self.transfers.cancel(node.id(), Owner::Boot);
                 node.boot.stop();
                 node.boot.start(now_ns);
             }
@@ -233,7 +235,7 @@ impl Network {
 
     /// Whatever time has brought. Sends SYNC first, so that nothing delays it.
     pub fn on_time(&mut self, now_ns: u64, out: &mut Outbox) {
-        self.sync(now_ns, out);
+        self.sync_and_pdos(now_ns, out);
         if !self.bus_off {
             self.produce(now_ns, out);
         }
@@ -337,28 +339,48 @@ impl Network {
         }
         if self.started && !was_started {
             self.tell(Event::NetworkStarted);
-            if self.settings.start_all_nodes && self.settings.start_nodes && self.safe.is_none() {
-                for node in &mut self.nodes {
-                    if node.boot.is_running() {
-                        node.wanted = OPERATIONAL;
-                    }
-                }
-                self.command(NmtCommand::Start, 0);
-                for i in 0..self.nodes.len() {
-                    self.gate(now_ns, i);
-                }
-                return;
+            if self.settings.start_all_nodes && self.settings.start_nodes {
+                return self.start_all(now_ns);
             }
         }
         let wait_for_all = self.settings.start_all_nodes && !self.started;
-        if !kept && self.settings.start_nodes && !wait_for_all {
-            let command = self.safe.unwrap_or(NmtCommand::Start);
-            self.nodes[i].wanted = state_after(command).unwrap_or(127);
-            // What it told before it was started does not keep its process data closed.
-            self.nodes[i].state = None;
-            self.command(command, id);
+        if kept {
+            // The safe state holds for a node that was found running, too.
+            if let Some(safe) = self.safe {
+                self.hold(now_ns, i, safe);
+            }
+        } else if self.settings.start_nodes && !wait_for_all {
+            match self.safe {
+                Some(safe) => self.hold(now_ns, i, safe),
+                None => {
+                    let node = &mut self.nodes[i];
+                    // What it told before it was started does not keep its process data closed.
+                    (node.wanted, node.state) = (OPERATIONAL, None);
+                    self.command(NmtCommand::Start, id);
+                }
+            }
         }
         self.gate(now_ns, i);
+    }
+
+    /// All booted nodes at once (1F80h bit 1), or all into the safe state.
+    fn start_all(&mut self, now_ns: u64) {
+        for i in 0..self.nodes.len() {
+            if !self.nodes[i].boot.is_running() {
+                continue;
+            }
+            match self.safe {
+                Some(safe) => self.hold(now_ns, i, safe),
+                None => {
+                    let node = &mut self.nodes[i];
+                    (node.wanted, node.state) = (OPERATIONAL, None);
+                    self.gate(now_ns, i);
+                }
+            }
+        }
+        if self.safe.is_none() {
+            self.command(NmtCommand::Start, 0);
+        }
     }
 
     /// When [`Self::on_time`] has something to do next.

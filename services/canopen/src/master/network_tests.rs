@@ -351,3 +351,131 @@ mod anything {
         }
     }
 }
+
+#[test]
+fn the_sync_goes_before_its_pdos_and_says_how_late_it_is() {
+    let mut config = config(json!([]));
+    config["sync_period"] = "10ms".into();
+    let mut bus = Bus::new(config, &[], false);
+    bus.start();
+    let first = bus.network.next_sync_ns.unwrap();
+    let mut out = Outbox::default();
+    assert_eq!(bus.network.sync(first, &mut out), Some(0));
+    assert_eq!(bus.network.sync(first, &mut out), None, "once");
+    assert_eq!(out.drain().count(), 1);
+    let late = first + 10 * MS + 7_000;
+    assert!(!bus.network.is_sync_near(first + 5 * MS) && bus.network.is_sync_near(first + 9 * MS));
+    assert!(bus.network.is_sync_near(late), "it is due");
+    assert_eq!(bus.network.sync(late, &mut out), Some(7_000));
+    assert!(!bus.network.is_sync_near(late), "there is always time behind a SYNC");
+    // Two and a half periods slept over: the grid stays.
+    assert_eq!(bus.network.sync(first + 45 * MS, &mut out), Some(25 * MS));
+    assert_eq!((bus.network.counters().syncs, bus.network.counters().syncs_missed), (3, 2));
+    assert_eq!(bus.network.next_sync_ns, Some(first + 50 * MS));
+    assert_eq!(out.len(), 2);
+}
+
+/// What the master sent to a node by NMT since the last look; 0 is all.
+fn commands(bus: &mut Bus) -> Vec<(u8, u8)> {
+    let of_master = |(from, frame): (u8, CanFrame)| {
+        (from == 0 && frame.can_id == predefined::NMT).then(|| (frame.data[0], frame.data[1]))
+    };
+    bus.log.drain(..).filter_map(of_master).collect()
+}
+
+fn set_safe(bus: &mut Bus, safe: Option<NmtCommand>) {
+    let mut out = Outbox::default();
+    bus.network.set_safe(bus.now, safe, &mut out);
+    bus.pass(0, out);
+}
+
+#[test]
+fn the_end_of_the_safe_state_starts_what_it_held_and_nothing_else() {
+    let mut bus = Bus::new(config(json!([node(2), node(3)])), &[2, 3], false);
+    bus.start();
+    bus.run(200);
+    // A user stopped node 3 before.
+    let mut out = Outbox::default();
+    bus.network.nmt(bus.now, NmtCommand::Stop, 3, &mut out);
+    bus.pass(0, out);
+    bus.log.clear();
+    set_safe(&mut bus, Some(NmtCommand::EnterPreOperational));
+    assert_eq!(commands(&mut bus), [(128, 2)]);
+    bus.run(200);
+    assert!(!bus.network.nodes()[0].is_operational());
+    assert_eq!(commands(&mut bus), []);
+    set_safe(&mut bus, None);
+    assert_eq!(commands(&mut bus), [(1, 2)]);
+    bus.run(200);
+    assert!(bus.network.nodes()[0].is_operational() && !bus.network.nodes()[1].is_operational());
+}
+
+#[test]
+fn what_boots_in_the_safe_state_is_held_and_started_at_its_end() {
+    for all in [false, true] {
+        let mut config = config(json!([node(2), node(3)]));
+        config["start_all_nodes"] = all.into();
+        let mut bus = Bus::new(config, &[2, 3], false);
+        set_safe(&mut bus, Some(NmtCommand::EnterPreOperational));
+        bus.start();
+        bus.run(200);
+        assert!(bus.network.is_started());
+        let sent = commands(&mut bus);
+        assert!(
+            sent.contains(&(128, 2)) && sent.contains(&(128, 3)) && sent.iter().all(|c| c.0 != 1),
+            "{sent:?}"
+        );
+        set_safe(&mut bus, None);
+        assert_eq!(commands(&mut bus), [(1, 2), (1, 3)], "start_all_nodes = {all}");
+        bus.run(200);
+        assert!(bus.network.nodes().iter().all(NodeRun::is_operational), "start_all_nodes = {all}");
+    }
+}
+
+#[test]
+fn nodes_that_start_together_exchange_also_without_error_control() {
+    let mut one = node(2);
+    one.as_object_mut().unwrap().remove("heartbeat");
+    let mut config = config(json!([one]));
+    config["start_all_nodes"] = true.into();
+    let mut bus = Bus::new(config, &[2], false);
+    bus.start();
+    bus.run(100);
+    assert!(bus.network.nodes()[0].is_operational());
+}
+
+#[test]
+fn a_node_that_does_not_come_back_from_a_reset_is_lost() {
+    let mut bus = Bus::new(config(json!([node(2)])), &[2], false);
+    bus.start();
+    bus.run(200);
+    bus.said();
+    bus.slaves.clear();
+    let mut out = Outbox::default();
+    bus.network.nmt(bus.now, NmtCommand::ResetNode, 2, &mut out);
+    bus.pass(0, out);
+    bus.run(900);
+    assert_eq!(bus.said(), "", "a second for its boot-up message");
+    bus.run(200);
+    assert_eq!(bus.said(), "Lost { node: 2, guarding: false }\n");
+}
+
+#[test]
+fn an_answer_to_a_question_before_bus_off_answers_none_behind_it() {
+    let mut with_serial = node(2);
+    with_serial["check"] = json!(["device_type", "vendor"]);
+    let mut bus = Bus::new(config(json!([with_serial])), &[2], false);
+    let slave = bus.slaves.pop().unwrap();
+    bus.start();
+    bus.run(20);
+    // It was asked for its device type, and the bus went off and came back before it answered.
+    for class in [0x40, 0x100] {
+        bus.send(9, CanFrame { can_id: id_flag::ERR | class, len: 8, ..CanFrame::default() });
+    }
+    bus.log.clear();
+    bus.slaves.push(slave);
+    bus.run(1500);
+    assert!(bus.network.nodes()[0].boot.is_running());
+    let said = bus.said();
+    assert!(!said.contains("BootFailed"), "{said}");
+}

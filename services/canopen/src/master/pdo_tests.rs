@@ -266,3 +266,41 @@ fn a_lost_answer_leaves_no_pdo_behind() {
         bench.exchanges();
     }
 }
+
+/// More PDOs at once than an outbox holds: none is taken for sent that was not.
+#[test]
+fn pdos_that_find_no_room_are_sent_later() {
+    use crate::master::exchange::{Field, Plan, TxPdo};
+    const PDOS: u32 = 600;
+    for transmission in [255, 0] {
+        let field = Field { at: 0, bytes: 1, pdo_bit: 0, bits: 8, range: 0, signed: false };
+        let tx = |id| TxPdo {
+            cob_id: 0x8000_0000 | id,
+            node: 5,
+            length: 1,
+            transmission,
+            inhibit_ns: 0,
+            event_ns: None,
+            fields: vec![field],
+        };
+        let plan = Plan { tx: (0..PDOS).map(tx).collect(), output_bytes: 1, ..Plan::default() };
+        let mut exchange = Exchange::new(plan, 0);
+        exchange.set_operational(5, true, 0);
+        let mut out = Outbox::default();
+        let mut sent = Vec::new();
+        for t_ns in 1..=3 {
+            if transmission == 255 {
+                assert_eq!(exchange.next_deadline().is_some(), sent.len() < PDOS as usize);
+                exchange.on_time(t_ns, &mut out);
+            } else {
+                exchange.sync_pdos(t_ns, &mut out);
+            }
+            sent.extend(out.drain().map(|frame| frame.can_id));
+        }
+        assert_eq!((sent.len(), out.dropped), (PDOS as usize, 0), "type {transmission}");
+        assert_eq!(exchange.counters().tx_pdos, u64::from(PDOS));
+        sent.sort_unstable();
+        sent.dedup();
+        assert_eq!(sent.len(), PDOS as usize);
+    }
+}

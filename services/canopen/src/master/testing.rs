@@ -36,6 +36,7 @@ pub fn dictionary(node: u8) -> ObjectDictionary {
     let ro32 = || var(DataType::Unsigned32, Access::Ro);
     b.var(0x1000, ro32().value(0x0003_0191));
     b.var(0x1001, var(DataType::Unsigned8, Access::Ro));
+    b.var(0x1005, var(DataType::Unsigned32, Access::Rw).value(0x80));
     let u32_array =
         || vec![(1, var(DataType::Unsigned32, Access::Rw)), (2, var(DataType::Unsigned32, Access::Rw))];
     b.record(0x1011, Access::Ro, vec![(1, var(DataType::Unsigned32, Access::Rw))]);

@@ -3,7 +3,7 @@
 use super::boot::SdoEnd;
 use crate::protocol::abort::Abort;
 use crate::protocol::io::Outbox;
-use crate::protocol::sdo::{Channel, ClientConfig, Direction, Failure, Finished, Options, SdoClient};
+use crate::protocol::sdo::{Channel, ClientConfig, Direction, Failure, Finished, Mode, Options, SdoClient};
 use ipc_types::payload::CanFrame;
 use std::collections::VecDeque;
 
@@ -11,6 +11,11 @@ use std::collections::VecDeque;
 pub const MAX_QUEUE: usize = 32;
 /// Ends that nobody took yet; the oldest is dropped, because who asked is gone.
 const MAX_ENDS: usize = 256;
+
+/// Writes by block that are under way at once, to different nodes. Their sub-blocks of 127 segments together have room in
+/// a driver's queue (`tx_queue`, 512), which sorts by priority: more would stand before SYNC, NMT and PDOs, and the bus is no
+/// faster for them.
+pub const LONG_WRITES: usize = 3;
 
 /// A job that boot-ups interrupt for longer than this fails: its node does not come back.
 const INTERRUPTED_NS: u64 = 20_000_000_000;
@@ -33,6 +38,18 @@ pub struct Request {
     pub data: Option<Vec<u8>>,
     pub owner: Owner,
     pub options: Options,
+}
+
+impl Request {
+    /// It may go by block, and then sends whole sub-blocks at once.
+    fn is_long_write(&self) -> bool {
+        let threshold = match self.options.mode {
+            Mode::Auto => ClientConfig::default().auto_block,
+            Mode::Block | Mode::BlockOnly => 0,
+            Mode::Segmented => return false,
+        };
+        self.data.as_ref().is_some_and(|data| data.len() >= threshold)
+    }
 }
 
 /// How a job's transfer ended.
@@ -179,10 +196,13 @@ impl Transfers {
         }
     }
 
-    /// Starts the next transfer of an idle node.
+    /// Starts the next transfer of an idle node. A long write waits while [`LONG_WRITES`] are under way; then
+    /// [`Self::on_time`] comes back to it.
     fn next(&mut self, now_ns: u64, node: u8, out: &mut Outbox) {
+        let is_long = |request: Option<&Request>| request.is_some_and(Request::is_long_write);
+        let long = self.slots.iter().filter(|slot| is_long(slot.current.as_ref())).count();
         let Some(slot) = self.slot(node) else { return };
-        if slot.current.is_some() {
+        if slot.current.is_some() || (long >= LONG_WRITES && is_long(slot.queue.front())) {
             return;
         }
         let Some(request) = slot.queue.pop_front() else { return };
@@ -239,10 +259,13 @@ impl Transfers {
     pub fn on_time(&mut self, now_ns: u64, out: &mut Outbox) {
         for i in 0..self.slots.len() {
             let slot = &mut self.slots[i];
+            let node = slot.node;
             if slot.current.is_none() {
+                if !slot.queue.is_empty() {
+                    self.next(now_ns, node, out);
+                }
                 continue;
             }
-            let node = slot.node;
             if let Some(finished) = slot.client.on_time(now_ns, out) {
                 self.ended(now_ns, node, finished, out);
             }
@@ -267,7 +290,8 @@ impl Transfers {
 mod tests {
     use super::*;
     use crate::master::testing::dictionary;
-    use crate::protocol::od::NoHooks;
+    use crate::protocol::data_type::DataType;
+    use crate::protocol::od::{Access, EntryDef, NoHooks, OdBuilder};
     use crate::protocol::sdo::{SdoServer, ServerConfig};
 
     #[test]
@@ -304,6 +328,55 @@ mod tests {
             }
         }
         assert_eq!(order, [0, 1, 2]);
+    }
+
+    #[test]
+    fn few_long_writes_at_once_and_the_others_in_their_turn() {
+        let mut transfers = Transfers::new((1..=6).map(|node| (node, 1_000_000)));
+        let mut out = Outbox::default();
+        let mut servers: Vec<_> = (1..=6)
+            .map(|node| {
+                let mut b = OdBuilder::new();
+                b.var(0x2000, EntryDef::new(DataType::Domain, Access::Rw).capacity(1 << 16));
+                let od = b.build(node).unwrap();
+                (SdoServer::new(Channel::default_of(node), ServerConfig::default(), &od), od)
+            })
+            .collect();
+        let value: Vec<u8> = (0..20_000u32).map(|i| (i % 251) as u8).collect();
+        for node in 1..=6 {
+            let request = Request {
+                index: 0x2000,
+                sub: 0,
+                data: Some(value.clone()),
+                owner: Owner::Job(node.into()),
+                options: Options::default(),
+            };
+            assert!(transfers.ask(0, node, request, &mut out));
+        }
+        // A short one does not wait for long ones of others.
+        transfers.read(0, 6, 0x2000, 0, Owner::Boot, &mut out);
+        let (mut ended, mut now_ns) = (0, 0);
+        while ended < 6 {
+            assert!(out.len() <= LONG_WRITES * 127 + 1 && out.dropped == 0, "{} frames at once", out.len());
+            let mut answers = Outbox::default();
+            for frame in out.drain().collect::<Vec<_>>() {
+                for (server, od) in &mut servers {
+                    server.on_frame(now_ns, &frame, od, &mut NoHooks, &mut answers);
+                }
+            }
+            for frame in answers.drain().collect::<Vec<_>>() {
+                transfers.on_frame(now_ns, (frame.id() & 0x7F) as u8, &frame, &mut out);
+            }
+            while let Some(end) = transfers.take_job_end() {
+                assert_eq!((end.result, end.bytes), (Ok(Vec::new()), value.len()));
+                ended += 1;
+            }
+            now_ns += 1000;
+            assert!(now_ns < 1_000_000_000, "stuck with {ended} of 6");
+            transfers.on_time(now_ns, &mut out);
+        }
+        assert!(transfers.take_boot_end().is_some());
+        assert!(servers.iter().all(|(_, od)| od.bytes(0x2000, 0) == Some(&value[..])));
     }
 
     #[test]

@@ -47,6 +47,10 @@ impl Outbox {
     pub fn is_empty(&self) -> bool {
         self.frames.is_empty()
     }
+    /// The next frame would be dropped: who can send it later had better do so.
+    pub fn is_full(&self) -> bool {
+        self.frames.len() >= OUTBOX_FRAMES
+    }
     pub fn len(&self) -> usize {
         self.frames.len()
     }

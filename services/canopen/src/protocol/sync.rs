@@ -84,9 +84,10 @@ impl Sync {
             self.next_ns = Some(t_ns.saturating_add(params.period_ns()));
         }
         if params.produces() || params.period_us == 0 || !params.cob.exists() {
-            self.timeout_ns = None;
-            self.timed_out = false;
-            self.seen = false;
+            self.forget();
+        } else if params.period_us != old.period_us || params.cob != old.cob {
+            // What was awaited by the old period or identifier is awaited no more.
+            self.forget();
         }
         if params.window_us == 0 {
             self.window_ends_ns = None;
@@ -226,5 +227,24 @@ mod tests {
         assert_eq!(sync.take_resolved(), None);
         assert_eq!(sync.on_frame(21 * MS, &cob.remote(0)), None);
         assert!(out.is_empty());
+    }
+
+    #[test]
+    fn a_slower_sync_is_not_missed_by_the_period_of_before() {
+        let mut out = Outbox::default();
+        let mut sync = Sync::default();
+        let params = SyncParams { cob: CobId(0x80), period_us: 10_000, window_us: 0, overflow: 0 };
+        sync.configure(0, params);
+        sync.on_frame(MS, &params.cob.frame(&[]));
+        sync.configure(2 * MS, params);
+        assert_eq!(sync.next_deadline(), Some(16 * MS), "the same again changes nothing");
+        let slower = SyncParams { period_us: 100_000, ..params };
+        sync.configure(2 * MS, slower);
+        assert_eq!((sync.next_deadline(), sync.on_time(16 * MS, true, &mut out)), (None, None));
+        sync.on_frame(101 * MS, &params.cob.frame(&[]));
+        assert_eq!(sync.next_deadline(), Some(251 * MS));
+        // Nor by an identifier that nobody sends any more.
+        sync.configure(102 * MS, SyncParams { cob: CobId(0x90), ..slower });
+        assert_eq!(sync.next_deadline(), None);
     }
 }

@@ -9,7 +9,7 @@ pub use setup::{check, topics};
 
 use super::job_port::JobPort;
 use super::ports::{Ports, Station};
-use super::{EVENTS_A_SECOND, RunError, TAKE_FRAMES, load, plc_of};
+use super::{EVENTS_A_SECOND, RunError, SEND_AT, TAKE_FRAMES, load, plc_of};
 use crate::config::{MasterConfig as Config, OnStop, OnStopWord};
 use crate::master::exchange::Exchange;
 use crate::master::network::Network;
@@ -24,7 +24,7 @@ use ipc_types::event::Budget;
 use ipc_types::inputs::InputsPort;
 use ipc_types::outputs::{Change, Guard, Words, gather};
 use ipc_types::payload::{CanFrame, HealthState, Inputs};
-use ipc_types::turns::Turns;
+use ipc_types::turns::{Turn, Turns};
 use ipc_types::wiring::ImageRange;
 use ipc_types::{Context, clock};
 use jobs::Desk;
@@ -73,7 +73,9 @@ pub fn run(mut ctx: Context) -> Result<(), RunError> {
         out: Outbox::default(),
         state: HealthState::Ready,
         events: Budget::new(EVENTS_A_SECOND),
+        sync_late_ns: (0, 0),
         sync_out_ns: (0, 0),
+        regular: Turn::default(),
     };
     service.introduce();
     if !service.await_driver(&mut turns)? {
@@ -96,8 +98,12 @@ struct Service {
     out: Outbox,
     state: HealthState,
     events: Budget,
-    /// From the SYNC to its last PDO in the driver's queue: the last time, and the longest.
+    /// From the time that the SYNC was due to its being sent: the last time, and the longest.
+    sync_late_ns: (u64, u64),
+    /// From the SYNC to its last PDO in the driver's queue, likewise.
     sync_out_ns: (u64, u64),
+    /// What is due with the heartbeat and waits for the SYNC.
+    regular: Turn,
 }
 
 impl Station for Service {
@@ -129,10 +135,11 @@ impl Service {
                 self.end();
                 return Ok(());
             }
-            // The SYNC goes before everything else.
+            // The SYNC goes before everything else, and is looked for again behind what may take long.
             self.sync();
             turns.drain();
             let more = self.take_frames();
+            self.sync();
             self.take_image();
             self.take_jobs();
             let now_ns = clock::mono_ns();
@@ -141,24 +148,34 @@ impl Service {
             self.on_time();
             self.answer_jobs();
             self.tell_events();
-            self.regular(due);
+            self.regular.beat |= due.beat;
+            self.regular.status |= due.status;
+            // A status takes longer than a SYNC may be late. The turn of the SYNC does it.
+            if !self.network.is_sync_near(now_ns) {
+                let regular = std::mem::take(&mut self.regular);
+                Station::regular(self, regular);
+            }
             let next_ns = self.ports.next_ns(now_ns, more, self.network.next_deadline());
             turns.come_again(next_ns)?;
         }
     }
 
-    /// The SYNC and its PDOs, if it is due.
+    /// The SYNC, if it is due. It is with the driver before its PDOs are made.
     fn sync(&mut self) {
-        let (began_ns, before) = (clock::mono_ns(), self.network.counters().syncs);
-        self.network.sync(began_ns, &mut self.out);
+        let began_ns = clock::mono_ns();
+        let Some(late_ns) = self.network.sync(began_ns, &mut self.out) else { return };
         self.send();
-        if self.network.counters().syncs > before {
-            let out_ns = clock::mono_ns().saturating_sub(began_ns);
-            self.sync_out_ns = (out_ns, self.sync_out_ns.1.max(out_ns));
+        self.network.sync_pdos(began_ns, &mut self.out);
+        if !self.out.is_empty() {
+            self.send();
         }
+        let out_ns = clock::mono_ns().saturating_sub(began_ns);
+        self.sync_late_ns = (late_ns, self.sync_late_ns.1.max(late_ns));
+        self.sync_out_ns = (out_ns, self.sync_out_ns.1.max(out_ns));
     }
 
     fn on_time(&mut self) {
+        self.sync();
         let now_ns = clock::mono_ns();
         self.network.on_time(now_ns, &mut self.out);
         if self.network.take_time_due(now_ns) {
@@ -177,17 +194,21 @@ impl Service {
 
     /// Takes frames of the bus; true when more may wait.
     fn take_frames(&mut self) -> bool {
-        let Some(rx) = &mut self.ports.rx else { return false };
-        let (network, out, inputs) = (&mut self.network, &mut self.out, &mut self.ports.inputs);
+        let Some(mut rx) = self.ports.rx.take() else { return false };
         let taken = rx.drain(TAKE_FRAMES, |frame, _| {
             if frame.fault().is_none() {
-                network.on_frame(frame.stamp.t_ns, frame, out);
+                self.network.on_frame(frame.stamp.t_ns, frame, &mut self.out);
                 // Each SYNC is published for itself, however many frames were waiting.
-                if network.exchange.is_sample_due() && network.exchange.take_sample().is_some() {
-                    publish(inputs, &mut network.exchange, true);
+                if self.network.exchange.is_sample_due() && self.network.exchange.take_sample().is_some() {
+                    self.publish(true);
+                }
+                // One frame may make a sub-block of 127: many nodes that acknowledge theirs would overfill the outbox.
+                if self.out.len() >= SEND_AT {
+                    self.send();
                 }
             }
         });
+        self.ports.rx = Some(rx);
         self.send();
         self.publish_sample();
         taken == TAKE_FRAMES

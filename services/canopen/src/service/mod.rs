@@ -11,6 +11,7 @@ mod ports;
 pub mod slave;
 mod words;
 
+use crate::protocol::io::OUTBOX_FRAMES;
 use dinrail_iec::Addressing;
 use ipc_types::rail::RailError;
 use ipc_types::stack::ServiceEntry;
@@ -20,6 +21,9 @@ use thiserror::Error;
 
 /// Frames taken from the bus before other work has its turn.
 const TAKE_FRAMES: usize = 256;
+/// Frames in the outbox that are handed over before more are taken: what one frame leads to, a sub-block of 127 segments
+/// and a command to each node, still has room.
+const SEND_AT: usize = OUTBOX_FRAMES / 2;
 /// Events a second that go to the rail.
 const EVENTS_A_SECOND: u32 = 30;
 

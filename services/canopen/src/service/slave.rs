@@ -5,7 +5,7 @@ mod jobs;
 
 use super::job_port::JobPort;
 use super::ports::{Ports, Station};
-use super::{EVENTS_A_SECOND, RunError, TAKE_FRAMES, addressing_near, load, node_ids, plc_of};
+use super::{EVENTS_A_SECOND, RunError, SEND_AT, TAKE_FRAMES, addressing_near, load, node_ids, plc_of};
 use crate::config::SlaveConfig as Config;
 use crate::device::Device;
 use crate::mistakes::Mistakes;
@@ -24,7 +24,7 @@ use dinrail_iec::Addressing;
 use ipc_types::can_queue::Handed;
 use ipc_types::event::{Budget, EventKind, Level};
 use ipc_types::outputs::{Change, Guard, SafeOn, Words, gather};
-use ipc_types::payload::{CanFrame, Inputs, can_flag};
+use ipc_types::payload::{CanFrame, Inputs};
 use ipc_types::port::Subscriber;
 use ipc_types::stack::ServiceEntry;
 use ipc_types::topic::TopicKind;
@@ -295,6 +295,9 @@ impl Service {
                 if is_late_sync(&self.node, frame, clock::mono_ns()) {
                     drop_synchronous(&mut self.out);
                 }
+                if self.out.len() >= SEND_AT {
+                    self.send();
+                }
             }
         });
         self.ports.rx = Some(rx);
@@ -306,12 +309,11 @@ impl Service {
     }
 
     /// Whether this is the echo of an error control message of this device, which would otherwise look like another
-    /// device with its node-id. Echoes of one stack do not tell who sent them, so they are counted.
+    /// device with its node-id. Echoes that do not tell who sent them are counted.
     fn is_own(&mut self, frame: &CanFrame) -> bool {
-        let own = frame.flags & can_flag::TX_ECHO != 0
-            && frame.can_id == predefined::ERROR_CONTROL + u32::from(self.node.node_id())
-            && self.unechoed > 0;
-        self.unechoed -= u32::from(own);
+        let own = frame.can_id == predefined::ERROR_CONTROL + u32::from(self.node.node_id())
+            && frame.echo_of(self.ctx.writer).unwrap_or(self.unechoed > 0);
+        self.unechoed = self.unechoed.saturating_sub(u32::from(own));
         if own && BootUpFirst::is_boot_up(frame, frame.can_id) {
             self.first.done();
         }

@@ -51,7 +51,7 @@ impl<'a> Checker<'a> {
             Callee::Function(index, pou) => match self.function_call(index, pou, args, span) {
                 Some((call, Some(ty))) => {
                     let elem = ty.elem().unwrap_or(ElemType::Bool);
-                    Val::Expr(Expr::new(elem, ExprKind::Call(Box::new(call))), ty)
+                    Val::Expr(Expr::new(elem, ExprKind::Call(Box::new(call))), ty.of_value())
                 }
                 Some((_, None)) => {
                     let d =

@@ -2,7 +2,7 @@
 
 use crate::Options;
 use crate::artifact::ElemType;
-use crate::diagnostic::{Diagnostic, Span};
+use crate::diagnostic::{Diagnostic, Severity, Span};
 use crate::ir::{Body, Const, Expr, ExprKind, LocatedUse, Place};
 use crate::types::{ElemExt, Type};
 
@@ -15,7 +15,7 @@ pub enum Val {
     Int(i128),
     /// Real literal: nearest `f64` and nearest `f32`.
     Real(f64, f32),
-    /// A value. The type is elementary, a subrange or an enumeration.
+    /// A value. The type is elementary or an enumeration.
     Expr(Expr, Type),
     /// A whole array, structure or function block instance.
     Whole(Place, Type),
@@ -47,6 +47,8 @@ pub struct Checker<'a> {
     pub pou: Option<&'a Pou>,
     pub options: &'a Options,
     pub diags: Vec<Diagnostic>,
+    /// Errors among them.
+    pub errors: usize,
     pub body: Body,
     /// Id of the current statement.
     pub statement: u32,
@@ -68,6 +70,7 @@ impl<'a> Checker<'a> {
             pou,
             options,
             diags: Vec::new(),
+            errors: 0,
             body: Body::default(),
             statement: 0,
             loops: 0,
@@ -79,6 +82,7 @@ impl<'a> Checker<'a> {
     }
 
     pub fn report(&mut self, d: Diagnostic) {
+        self.errors += usize::from(d.severity == Severity::Error);
         self.diags.push(d);
     }
 
@@ -119,7 +123,7 @@ impl<'a> Checker<'a> {
         let Some(elem) = ty.elem() else { return Val::Whole(place, ty.clone()) };
         if let Some(c) = self.counters.iter().rev().find(|c| c.place == place) {
             let e = Expr::new(elem, ExprKind::Temp(c.temp));
-            return Val::Expr(e, ty.clone());
+            return Val::Expr(e, ty.of_value());
         }
         let bytes = match place.storage {
             crate::artifact::Storage::Plain => elem.bytes(),
@@ -127,7 +131,7 @@ impl<'a> Checker<'a> {
             crate::artifact::Storage::Millis32 => 4,
         };
         self.note_load(&place, bytes);
-        Val::Expr(Expr::new(elem, ExprKind::Load(place)), ty.clone())
+        Val::Expr(Expr::new(elem, ExprKind::Load(place)), ty.of_value())
     }
 
     fn note_load(&mut self, place: &Place, bytes: u32) {

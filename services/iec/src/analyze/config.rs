@@ -107,6 +107,7 @@ impl Config<'_> {
             tasks.push(self.task(t));
         }
         let mut instances: Vec<InstanceInfo> = Vec::new();
+        let mut statements = 0;
         let mut instance_names: HashMap<String, Span> = HashMap::new();
         for p in &r.programs {
             if let Some(first) = instance_names.get(&p.name.key()) {
@@ -126,6 +127,15 @@ impl Config<'_> {
                 self.diags.push(d);
             }
             let Some(pou) = self.program(&p.type_name) else { continue };
+            let (from, to) = self.tables.pous[pou as usize].stmts;
+            statements += (to - from).max(1) as usize;
+            if statements > limits::STATEMENTS {
+                let text = format!("the program instances have more than {} statements", limits::STATEMENTS);
+                let d = Diagnostic::new("E0803", p.name.span, text)
+                    .help("every instance has code of its own: put it into a FUNCTION_BLOCK");
+                self.diags.push(d);
+                break;
+            }
             let index = instances.len() as u32;
             instances.push(InstanceInfo { name: p.name.text.clone(), pou, retain: p.retain.is_some() });
             self.attach(&mut tasks, p, index);

@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 
+use super::init::completed;
 use super::resolve::Resolver;
 use super::tables::{InitData, Pou, Tables, Var};
 use crate::diagnostic::{Diagnostic, Span};
@@ -126,6 +127,7 @@ impl<'u> Declare<'u, '_> {
             returns: None,
             bytes: 0,
             align: 1,
+            depth: 1,
             stmts: pou.stmts,
         });
         self.decls.push(pou);
@@ -171,12 +173,7 @@ impl<'u> Declare<'u, '_> {
                 false
             }
             State::Open if self.path.len() >= limits::INSTANCE_DEPTH as usize => {
-                let d = Diagnostic::new(
-                    "E0801",
-                    name.span,
-                    format!("types are nested more than {} deep", limits::INSTANCE_DEPTH),
-                );
-                self.diags.push(d);
+                self.diags.push(super::too_deep(name.span));
                 false
             }
             State::Open => true,
@@ -200,7 +197,7 @@ impl<'u> Declare<'u, '_> {
         // The type is known to its own initial value: TYPE c : (red, green) := green.
         r.enter(&decl.name, ty.clone(), own.clone());
         if let Some(i) = &decl.init {
-            let init = r.init(i, &ty, None);
+            let init = completed(r.init(i, &ty, None), &own);
             r.enter(&decl.name, ty, init);
         }
         self.path.pop();
@@ -254,7 +251,7 @@ impl<'u> Declare<'u, '_> {
     }
 
     fn layout(&mut self, pou: u32) {
-        let (mut bytes, mut align) = (0_u64, 1_u32);
+        let (mut bytes, mut align, mut depth) = (0_u64, 1_u32, 1_u32);
         let mut offsets = Vec::new();
         for v in &self.tables.pous[pou as usize].vars {
             if !v.has_storage() {
@@ -271,8 +268,15 @@ impl<'u> Declare<'u, '_> {
             offsets.push(bytes.min(u64::from(u32::MAX)) as u32);
             bytes += size;
             align = align.max(a);
+            if v.section != Section::InOut {
+                depth = depth.max(1 + self.tables.depth_of(&v.ty));
+            }
         }
         bytes = bytes.next_multiple_of(u64::from(align)).max(1);
+        if depth > limits::INSTANCE_DEPTH {
+            self.diags.push(super::too_deep(self.tables.pous[pou as usize].name.span));
+            depth = 1;
+        }
         let p = &mut self.tables.pous[pou as usize];
         if bytes > limits::MEMORY_BYTES {
             let d = Diagnostic::new(
@@ -288,6 +292,7 @@ impl<'u> Declare<'u, '_> {
         }
         p.bytes = bytes as u32;
         p.align = align;
+        p.depth = depth;
     }
 
     /// All variables of a POU, and a function's result.
@@ -447,7 +452,7 @@ impl<'u> Declare<'u, '_> {
                 r.diags.push(d);
                 InitData::Default
             }
-            Some(i) => r.init(i, &ty, scope),
+            Some(i) => completed(r.init(i, &ty, scope), &type_init),
             None => type_init,
         };
         let located = decl.at.as_ref().and_then(|at| match (kind, block.section) {

@@ -96,23 +96,8 @@ impl Checker<'_> {
                 format!("literals of type `{}` are not supported", prefix.text),
             );
         }
-        let unsupported = [
-            "STRING",
-            "WSTRING",
-            "CHAR",
-            "WCHAR",
-            "D",
-            "DATE",
-            "TOD",
-            "TIME_OF_DAY",
-            "DT",
-            "DATE_AND_TIME",
-            "LD",
-            "LDATE",
-            "LTOD",
-            "LDT",
-        ];
-        if unsupported.contains(&key.as_str()) {
+        let text = ["STRING", "WSTRING", "CHAR", "WCHAR"].contains(&key.as_str());
+        if text || crate::lexer::is_date(&key) {
             return self.error("E0906", span, format!("literals of type {key} are not supported yet"));
         }
         self.error("E0303", prefix.span, format!("there is no type `{}`", prefix.text))
@@ -122,6 +107,11 @@ impl Checker<'_> {
         let v = self.expr(operand, want);
         match (op, v) {
             (_, Val::Error) => Val::Error,
+            // An enumeration is carried as INT, but its values are no numbers.
+            (Unary::Neg | Unary::Plus, v @ Val::Expr(_, Type::Enum(_))) => {
+                let text = if op == Unary::Neg { "-" } else { "+" };
+                self.bad_operand(text, &v, operand.span)
+            }
             (Unary::Plus, v @ (Val::Int(_) | Val::Real(..))) => v,
             (Unary::Neg, Val::Int(v)) => self.literal_in_range(-v, span),
             (Unary::Neg, Val::Real(d, f)) => Val::Real(-d, -f),
@@ -335,7 +325,7 @@ impl Checker<'_> {
 /// A declared constant keeps its type.
 fn constant(c: Const, ty: Type) -> Val {
     match ty.elem() {
-        Some(e) => Val::Expr(Expr::new(e, ExprKind::Const(c)), ty),
+        Some(e) => Val::Expr(Expr::new(e, ExprKind::Const(c)), ty.of_value()),
         None => Val::Error,
     }
 }

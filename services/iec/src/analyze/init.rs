@@ -1,5 +1,7 @@
 //! Initial values.
 
+use std::collections::HashMap;
+
 use super::check::{Checker, Val};
 use super::resolve::Resolver;
 use super::tables::{InitData, Pou};
@@ -7,6 +9,30 @@ use crate::diagnostic::{Diagnostic, Span};
 use crate::ir::{Const, ExprKind};
 use crate::syntax::ast::{Expr, Ident, Init, Section};
 use crate::types::{ArrayType, Type};
+
+/// An initial value as given, where it says nothing completed by that of the type.
+///
+/// `own` of an array is one repeated value (its element type's), or what the array's own type gives.
+pub fn completed(given: InitData, own: &InitData) -> InitData {
+    match (given, own) {
+        (InitData::Default, own) => own.clone(),
+        // The later one counts.
+        (InitData::Members(given), InitData::Members(own)) => {
+            InitData::Members(own.iter().chain(given.iter()).cloned().collect())
+        }
+        (InitData::Array(given), InitData::Array(own)) => {
+            let [(total, of)] = &**own else { return InitData::Array(given) };
+            let mut out: Vec<(u32, InitData)> =
+                given.iter().map(|(n, d)| (*n, completed(d.clone(), of))).collect();
+            let used = out.iter().map(|(n, _)| *n).fold(0, u32::saturating_add);
+            if used < *total {
+                out.push((total - used, of.clone()));
+            }
+            InitData::Array(out.into())
+        }
+        (given, _) => given,
+    }
+}
 
 impl Resolver<'_> {
     /// Value of an initialiser for a variable of this type.
@@ -102,12 +128,12 @@ impl Resolver<'_> {
             }
             out.push((n as u32, value));
         }
-        InitData::Array(out)
+        InitData::Array(out.into())
     }
 
     fn init_members(&mut self, members: &[(Ident, Init)], ty: &Type, pou: Option<&Pou>) -> InitData {
         let mut out: Vec<(u32, InitData)> = Vec::new();
-        let mut seen: Vec<(String, Span)> = Vec::new();
+        let mut seen: HashMap<String, Span> = HashMap::new();
         for (name, init) in members {
             let found: Option<(u32, Type)> = match ty {
                 Type::Struct(s) => self.tables.structs[*s as usize]
@@ -127,11 +153,11 @@ impl Resolver<'_> {
                 }
                 _ => None,
             };
-            if let Some((_, first)) = seen.iter().find(|(k, _)| *k == name.key()) {
+            if let Some(first) = seen.get(&name.key()) {
                 self.diags.push(super::duplicate(&name.text, *first, name.span));
                 continue;
             }
-            seen.push((name.key(), name.span));
+            seen.insert(name.key(), name.span);
             let Some((index, member)) = found else {
                 let d = Diagnostic::new(
                     "E0309",
@@ -144,6 +170,6 @@ impl Resolver<'_> {
             let value = self.init(init, &member, pou);
             out.push((index, value));
         }
-        InitData::Members(out)
+        InitData::Members(out.into())
     }
 }

@@ -111,6 +111,11 @@ fn image_layout(options: &Options) -> Result<ImageLayout, Box<Diagnostic>> {
     })
 }
 
+/// Types in types, over the limit.
+pub(crate) fn too_deep(span: Span) -> Diagnostic {
+    Diagnostic::new("E0801", span, format!("types are nested more than {} deep", limits::INSTANCE_DEPTH))
+}
+
 /// A name that is taken, for the message of the second declaration.
 pub(crate) fn duplicate(name: &str, first: Span, second: Span) -> Diagnostic {
     Diagnostic::new("E0301", second, format!("`{name}` is declared twice"))

@@ -350,7 +350,7 @@ impl Checker<'_> {
     /// Any number as REAL or LREAL.
     pub fn as_real(&mut self, v: Val, span: Span, ty: ElemType) -> Option<Expr> {
         match v {
-            Val::Expr(e, _) if e.ty.is_int() => {
+            Val::Expr(e, t) if e.ty.is_int() && !matches!(t, Type::Enum(_)) => {
                 Some(fold(Expr::new(ty, ExprKind::Convert(Convert::ToFloat, Box::new(e)))))
             }
             v @ (Val::Expr(..) | Val::Int(_) | Val::Real(..)) => {

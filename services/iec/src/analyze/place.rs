@@ -89,6 +89,15 @@ impl Checker<'_> {
                 format!("`{}` is no constant that is known here", name.text),
             )
             .help("constants stand in VAR CONSTANT or VAR_GLOBAL CONSTANT before their use");
+        } else if let Some(t) = self.tables.types.get(&key) {
+            d = Diagnostic::new("E0302", name.span, format!("`{}` is a type, not a variable", name.text));
+            let values = match t.ty {
+                Type::Enum(e) => self.tables.enums.get(e as usize).map(|e| e.values.as_slice()),
+                _ => None,
+            };
+            if let Some((value, _)) = values.and_then(<[_]>::first) {
+                d = d.help(format!("its values are written {}#{}", name.text, value.text));
+            }
         } else if let Some(n) = near {
             d = d.help(format!("did you mean `{n}`?"));
         } else if let Some(&p) = self.tables.pous_by_name.get(&key) {
@@ -350,7 +359,9 @@ impl Checker<'_> {
         {
             let c = if *op == BinOp::Add { c } else { -c };
             let (least, most) = self.range(x);
-            if least + i128::from(c) >= i128::from(lo) && most + i128::from(c) <= i128::from(hi) {
+            let (type_lo, type_hi) = value.ty.range();
+            let (from, to) = (least + i128::from(c), most + i128::from(c));
+            if from >= i128::from(lo).max(type_lo) && to <= i128::from(hi).min(type_hi) {
                 return ((**x).clone(), lo - c, hi - c);
             }
         }

@@ -1,11 +1,17 @@
 //! The call graph: recursion is refused, so the depth of the stack is known.
 
-use petgraph::algo::tarjan_scc;
+use std::collections::{HashMap, HashSet};
+
+use petgraph::algo::kosaraju_scc;
 use petgraph::graph::{DiGraph, NodeIndex};
 
 use super::tables::Tables;
 use crate::diagnostic::Diagnostic;
 use crate::ir::Body;
+use crate::limits;
+
+/// Calls of a cycle that the message names.
+const SHOWN: usize = 16;
 
 /// Reports every cycle of calls; the longest chain of calls otherwise, the task's frame included.
 pub fn check(tables: &Tables, bodies: &[Option<Body>], diags: &mut Vec<Diagnostic>) -> u32 {
@@ -19,17 +25,22 @@ pub fn check(tables: &Tables, bodies: &[Option<Body>], diags: &mut Vec<Diagnosti
     // Components come in reverse topological order: callees first.
     let mut depth = vec![1_u32; bodies.len()];
     let mut longest = 0;
-    for component in tarjan_scc(&graph) {
+    let mut deepest = None;
+    // This one is not recursive itself, however long the chain.
+    for component in kosaraju_scc(&graph) {
         let own_loop = component.len() == 1 && graph.contains_edge(component[0], component[0]);
         if component.len() > 1 || own_loop {
             let cycle = cycle_path(&graph, &component);
             let pou = |n: &NodeIndex| &tables.pous[graph[*n] as usize];
-            let names: Vec<&str> = cycle.iter().map(|n| pou(n).name.text.as_str()).collect();
+            let mut names: Vec<&str> = cycle.iter().map(|n| pou(n).name.text.as_str()).take(SHOWN).collect();
+            if cycle.len() > SHOWN {
+                names.push("...");
+            }
             let first = &pou(&cycle[0]).name;
             let mut d = Diagnostic::new("E0509", first.span, format!("`{}` calls itself", first.text))
                 .label(format!("{} -> {}", names.join(" -> "), first.text))
                 .help("recursion is not allowed by the standard; use a loop");
-            for n in &cycle[1..] {
+            for n in cycle.iter().take(SHOWN).skip(1) {
                 d = d.also(pou(n).name.span, format!("by way of {}", pou(n).name.text));
             }
             diags.push(d);
@@ -39,8 +50,15 @@ pub fn check(tables: &Tables, bodies: &[Option<Body>], diags: &mut Vec<Diagnosti
             let below = graph.neighbors(n).map(|m| depth[graph[m] as usize]).max().unwrap_or(0);
             let own = below + 1;
             depth[graph[n] as usize] = own;
-            longest = longest.max(own);
+            if own > longest {
+                (longest, deepest) = (own, Some(n));
+            }
         }
+    }
+    if let Some(n) = deepest.filter(|_| longest > limits::CALL_DEPTH) {
+        let name = &tables.pous[graph[n] as usize].name;
+        let text = format!("calls are nested {longest} deep, at most {} are allowed", limits::CALL_DEPTH);
+        diags.push(Diagnostic::new("E0801", name.span, text).label("the longest chain begins here"));
     }
     longest + 1
 }
@@ -49,7 +67,8 @@ pub fn check(tables: &Tables, bodies: &[Option<Body>], diags: &mut Vec<Diagnosti
 fn cycle_path(graph: &DiGraph<u32, ()>, component: &[NodeIndex]) -> Vec<NodeIndex> {
     let Some(start) = component.iter().copied().min_by_key(|n| graph[*n]) else { return Vec::new() };
     // Breadth first from the start until an edge leads back to it: the shortest cycle.
-    let mut before: std::collections::HashMap<NodeIndex, NodeIndex> = std::collections::HashMap::new();
+    let component: HashSet<NodeIndex> = component.iter().copied().collect();
+    let mut before: HashMap<NodeIndex, NodeIndex> = HashMap::new();
     let mut queue = std::collections::VecDeque::from([start]);
     while let Some(n) = queue.pop_front() {
         let mut next: Vec<NodeIndex> = graph.neighbors(n).collect();

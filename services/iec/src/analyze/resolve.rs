@@ -3,6 +3,7 @@
 use std::rc::Rc;
 
 use super::check::{Checker, Val};
+use super::init::completed;
 use super::tables::{Enum, Field, InitData, NamedType, Struct, Tables};
 use crate::address::{AddressSize, LocatedAddress, parse_address};
 use crate::artifact::{AreaKind, ElemType, Storage};
@@ -27,7 +28,7 @@ impl Resolver<'_> {
             TypeSpecKind::Error => (Type::Error, InitData::Default),
             TypeSpecKind::Named(name) => self.named(name),
             TypeSpecKind::Subrange { base, lo, hi } => (self.subrange(base, lo, hi, pou), InitData::Default),
-            TypeSpecKind::Array { dims, of } => (self.array(spec.span, dims, of, pou), InitData::Default),
+            TypeSpecKind::Array { dims, of } => self.array(spec.span, dims, of, pou),
             TypeSpecKind::Struct(_) | TypeSpecKind::Enum(_) => {
                 let what =
                     if matches!(spec.kind, TypeSpecKind::Struct(_)) { "STRUCT" } else { "enumeration" };
@@ -78,10 +79,14 @@ impl Resolver<'_> {
             "POINTER",
             "REFERENCE",
         ];
+        let unknown = || Diagnostic::new("E0303", name.span, format!("there is no type `{}`", name.text));
         let d = if unsupported.contains(&key.as_str()) {
             Diagnostic::new("E0906", name.span, format!("type {key} is not supported yet"))
+        } else if self.diags.len() > limits::ERRORS {
+            // To look for the nearest name takes its time.
+            unknown()
         } else {
-            Diagnostic::new("E0303", name.span, format!("there is no type `{}`", name.text)).help(
+            unknown().help(
                 nearest(
                     &key,
                     self.tables
@@ -153,13 +158,20 @@ impl Resolver<'_> {
         Type::Subrange(Rc::new(Subrange { base: e, lo: l, hi: h }))
     }
 
-    fn array(&mut self, span: Span, dims: &[(Expr, Expr)], of: &TypeSpec, pou: Option<&Pou>) -> Type {
+    fn array(
+        &mut self,
+        span: Span,
+        dims: &[(Expr, Expr)],
+        of: &TypeSpec,
+        pou: Option<&Pou>,
+    ) -> (Type, InitData) {
+        const WRONG: (Type, InitData) = (Type::Error, InitData::Default);
         let (of_ty, of_init) = self.spec(of, pou);
         let mut bounds = Vec::new();
         let mut elements: i128 = 1;
         for (lo, hi) in dims {
             let (Some(l), Some(h)) = (self.constant(lo, pou), self.constant(hi, pou)) else {
-                return Type::Error;
+                return WRONG;
             };
             let fits = |v: i128| i32::try_from(v).is_ok();
             if l > h || !fits(l) || !fits(h) {
@@ -170,22 +182,17 @@ impl Resolver<'_> {
                 )
                 .help("the lower bound comes first; bounds are DINT values");
                 self.diags.push(d);
-                return Type::Error;
+                return WRONG;
             }
             elements *= h - l + 1;
             bounds.push((l as i64, h as i64));
         }
         if of_ty == Type::Error {
-            return Type::Error;
+            return WRONG;
         }
-        if of_init != InitData::Default {
-            let d = Diagnostic::new(
-                "E0905",
-                of.span,
-                "array elements of a type with its own initial value are not supported yet",
-            )
-            .help("initialise the array instead");
-            self.diags.push(d);
+        if self.tables.depth_of(&of_ty) >= limits::INSTANCE_DEPTH {
+            self.diags.push(super::too_deep(span));
+            return WRONG;
         }
         let bytes = elements * i128::from(self.tables.size_of(&of_ty).max(1));
         if elements > limits::ARRAY_ELEMENTS || bytes > i128::from(limits::MEMORY_BYTES) {
@@ -200,25 +207,42 @@ impl Resolver<'_> {
                 limits::MEMORY_BYTES
             ));
             self.diags.push(d);
-            return Type::Error;
+            return WRONG;
         }
         // `ARRAY OF ARRAY` keeps its own level: elements are reached with a[i][j].
-        Type::Array(Rc::new(ArrayType { dims: bounds, of: of_ty }))
+        let init = match of_init {
+            InitData::Default => InitData::Default,
+            // Every element starts with what its type says.
+            own => InitData::Array([(elements as u32, own)].into()),
+        };
+        (Type::Array(Rc::new(ArrayType { dims: bounds, of: of_ty })), init)
     }
 
     /// A named structure; its fields' types are known already.
     pub fn structure(&mut self, name: &Ident, fields: &[crate::syntax::ast::VarDecl]) -> Type {
         let mut out: Vec<Field> = Vec::new();
-        let (mut bytes, mut align) = (0_u64, 1_u32);
+        let (mut bytes, mut align, mut depth) = (0_u64, 1_u32, 1_u32);
+        let members: usize = fields.iter().map(|d| d.names.len()).sum();
+        if members == 0 || members > limits::MEMBERS {
+            let d = if members == 0 {
+                Diagnostic::new("E0905", name.span, format!("STRUCT `{}` has no member", name.text))
+            } else {
+                let text = format!("STRUCT `{}` has more than {} members", name.text, limits::MEMBERS);
+                Diagnostic::new("E0801", name.span, text)
+            };
+            self.diags.push(d);
+            return Type::Error;
+        }
         for decl in fields {
             if let Some(at) = &decl.at {
                 self.diags.push(Diagnostic::new("E0905", at.span, "AT inside a STRUCT is not supported"));
             }
             let (ty, type_init) = self.spec(&decl.spec, None);
             let init = match &decl.init {
-                Some(i) => self.init(i, &ty, None),
+                Some(i) => completed(self.init(i, &ty, None), &type_init),
                 None => type_init,
             };
+            depth = depth.max(1 + self.tables.depth_of(&ty));
             for name in &decl.names {
                 if let Some(first) = out.iter().find(|f| f.name.text.eq_ignore_ascii_case(&name.text)) {
                     self.diags.push(super::duplicate(&name.text, first.name.span, name.span));
@@ -245,8 +269,13 @@ impl Resolver<'_> {
             ));
             return Type::Error;
         }
+        if depth > limits::INSTANCE_DEPTH {
+            self.diags.push(super::too_deep(name.span));
+            return Type::Error;
+        }
         let index = self.tables.structs.len() as u32;
-        self.tables.structs.push(Struct { name: name.text.clone(), fields: out, bytes: bytes as u32, align });
+        let bytes = bytes as u32;
+        self.tables.structs.push(Struct { name: name.text.clone(), fields: out, bytes, align, depth });
         Type::Struct(index)
     }
 

@@ -1,14 +1,14 @@
 //! Statements to IR.
 
-use super::calls_scan::changes;
+use super::calls_scan::Scan;
 use super::check::{Checker, Counter, Val};
 use super::tables::Tables;
-use crate::Options;
 use crate::artifact::{ElemType, Storage};
-use crate::diagnostic::{Diagnostic, Span};
+use crate::diagnostic::{Diagnostic, Severity, Span};
 use crate::ir::{Base, Body, For, Step, Stmt, StmtKind};
 use crate::syntax::ast;
 use crate::types::{ElemExt, Type};
+use crate::{Options, limits};
 
 /// Checks the body of a POU.
 pub fn check_body(
@@ -19,6 +19,10 @@ pub fn check_body(
     diags: &mut Vec<Diagnostic>,
 ) -> Body {
     let mut ck = Checker::new(tables, tables.pous.get(pou as usize), options);
+    if diags.len() >= limits::ERRORS && diags.iter().any(|d| d.severity == Severity::Error) {
+        ck.body.dropped = Some(decl.name.span);
+        return ck.body;
+    }
     let stmts = ck.statements(&decl.body);
     ck.body.stmts = stmts;
     ck.missing_result(decl);
@@ -28,10 +32,14 @@ pub fn check_body(
 }
 
 impl Checker<'_> {
+    fn scan<'n>(&'n self, name: &'n str) -> Scan<'n> {
+        Scan { name, tables: self.tables, pou: self.pou }
+    }
+
     /// A function that never assigns its result returns its type's initial value: surely a mistake.
     fn missing_result(&mut self, decl: &ast::Pou) {
         let returns = self.pou.is_some_and(|p| p.returns.is_some());
-        if decl.kind == ast::PouKind::Function && returns && !changes(&decl.body, &decl.name.text) {
+        if decl.kind == ast::PouKind::Function && returns && !self.scan(&decl.name.text).changes(&decl.body) {
             let d = Diagnostic::new(
                 "W0206",
                 decl.name.span,
@@ -47,6 +55,11 @@ impl Checker<'_> {
     }
 
     fn statement_checked(&mut self, s: &ast::Stmt) -> Option<Stmt> {
+        if self.errors > limits::ERRORS_PER_FILE {
+            // To look for the nearest name of each unknown one takes its time.
+            self.dropped = true;
+            return None;
+        }
         let outer = self.statement;
         self.statement = s.id;
         let kind = self.kind(s);
@@ -273,7 +286,7 @@ impl Checker<'_> {
         );
         let step = self.step(by, elem);
         let changed = match &var.kind {
-            ast::ExprKind::Name(name) => changes(body, &name.text),
+            ast::ExprKind::Name(name) => self.scan(&name.text).changes(body),
             _ => true,
         };
         if let (true, ast::ExprKind::Name(name)) = (changed, &var.kind) {
@@ -318,28 +331,15 @@ impl Checker<'_> {
                 self.report(Diagnostic::new("E0411", by.span, "FOR with BY 0 never ends"));
                 None
             }
-            Val::Int(n) => {
-                let (lo, hi) = elem.range();
-                let width = hi - lo;
-                match i64::try_from(n) {
-                    Ok(v) if n.abs() <= width => Some(Step::Const(v)),
-                    _ => {
-                        self.report(Diagnostic::new(
-                            "E0404",
-                            by.span,
-                            format!("a step of {n} is wider than {}", elem.name()),
-                        ));
-                        None
-                    }
-                }
-            }
+            Val::Int(n) => self.constant_step(n, by.span, elem),
             Val::Expr(e, Type::Elem(t)) if t.is_int() => match e.as_int() {
                 Some(0) => {
                     self.report(Diagnostic::new("E0411", by.span, "FOR with BY 0 never ends"));
                     None
                 }
-                Some(v) if t != ElemType::Ulint || v > 0 => Some(Step::Const(v)),
-                _ => {
+                // As far as literals may reach: a wider step would not fit the loop's own arithmetic.
+                Some(v) => self.constant_step(crate::ir::value(t, v), by.span, elem),
+                None => {
                     let wide = if t.is_signed() { ElemType::Lint } else { ElemType::Ulint };
                     Some(Step::Dynamic(super::conversions::convert(e, wide)))
                 }
@@ -352,6 +352,19 @@ impl Checker<'_> {
                     by.span,
                     format!("step of FOR: an integer is needed, found {found}"),
                 ));
+                None
+            }
+        }
+    }
+
+    fn constant_step(&mut self, n: i128, span: Span, elem: ElemType) -> Option<Step> {
+        let (lo, hi) = elem.range();
+        match i64::try_from(n) {
+            Ok(v) if n.abs() <= hi - lo => Some(Step::Const(v)),
+            _ => {
+                let d =
+                    Diagnostic::new("E0404", span, format!("a step of {n} is wider than {}", elem.name()));
+                self.report(d);
                 None
             }
         }

@@ -1,6 +1,7 @@
 //! What the analysis knows about the whole program, and the result it hands to the emitter.
 
 use std::collections::HashMap;
+use std::rc::Rc;
 
 use crate::address::LocatedAddress;
 use crate::artifact::{ElemType, Storage};
@@ -9,7 +10,7 @@ use crate::ir::{Body, Const};
 use crate::syntax::ast::{Ident, PouKind, Section};
 use crate::types::{ElemExt, Type};
 
-/// Initial value of a variable.
+/// Initial value of a variable. Cheap to clone: many variables may share a long list.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub enum InitData {
     /// The type's own.
@@ -17,9 +18,9 @@ pub enum InitData {
     Default,
     Scalar(Const),
     /// Items with repetition, row by row.
-    Array(Vec<(u32, InitData)>),
+    Array(Rc<[(u32, InitData)]>),
     /// By index of the member.
-    Members(Vec<(u32, InitData)>),
+    Members(Rc<[(u32, InitData)]>),
 }
 
 /// A located variable's place.
@@ -71,6 +72,8 @@ pub struct Pou {
     /// Size and alignment of an instance (function blocks).
     pub bytes: u32,
     pub align: u32,
+    /// Levels of types in an instance.
+    pub depth: u32,
     /// Statement ids: from, to (exclusive).
     pub stmts: (u32, u32),
 }
@@ -89,6 +92,8 @@ pub struct Struct {
     pub fields: Vec<Field>,
     pub bytes: u32,
     pub align: u32,
+    /// Levels of types in it, itself included.
+    pub depth: u32,
 }
 
 #[derive(Debug, Clone)]
@@ -158,6 +163,16 @@ impl Tables {
         }
     }
 
+    /// Levels of structures, instances and arrays in a variable of this type; at most [`crate::limits::INSTANCE_DEPTH`].
+    pub fn depth_of(&self, ty: &Type) -> u32 {
+        match ty {
+            Type::Elem(_) | Type::Subrange(_) | Type::Enum(_) | Type::Error => 0,
+            Type::Array(a) => 1 + self.depth_of(&a.of),
+            Type::Struct(i) => self.structs.get(*i as usize).map_or(0, |s| s.depth),
+            Type::Fb(i) => self.pous.get(*i as usize).map_or(0, |p| p.depth),
+        }
+    }
+
     /// As a message names it.
     pub fn type_name(&self, ty: &Type) -> String {
         match ty {
@@ -221,7 +236,7 @@ impl Tables {
         let total = a.elements() as usize;
         let mut n = 0;
         if let InitData::Array(items) = init {
-            for (count, item) in items {
+            for (count, item) in items.iter() {
                 for _ in 0..*count {
                     if n >= total {
                         return;

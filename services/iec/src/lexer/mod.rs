@@ -153,6 +153,15 @@ fn skip_comment(lex: &mut Lexer<'_, TokenKind>, open: &[u8], close: &[u8]) -> Fi
 fn typed_literal(lex: &mut Lexer<'_, TokenKind>) {
     let rest = lex.remainder().as_bytes();
     let at = |i: usize| rest.get(i).copied().unwrap_or(b' ');
+    if at(0).is_ascii_digit() && is_date(lex.slice().trim_end_matches('#')) {
+        // 2024-01-31-12:30:15.5
+        let mut i = 0;
+        while at(i).is_ascii_digit() || (matches!(at(i), b'-' | b':' | b'.') && at(i + 1).is_ascii_digit()) {
+            i += 1;
+        }
+        lex.bump(i);
+        return;
+    }
     let mut i = usize::from(matches!(at(0), b'+' | b'-') && at(1).is_ascii_digit());
     loop {
         let c = at(i);
@@ -172,6 +181,25 @@ fn typed_literal(lex: &mut Lexer<'_, TokenKind>) {
         i += 1;
     }
     lex.bump(i);
+}
+
+/// True for the prefix of a literal that holds a date or a time of day.
+pub(crate) fn is_date(prefix: &str) -> bool {
+    const DATES: &[&str] = &[
+        "D",
+        "DATE",
+        "TOD",
+        "TIME_OF_DAY",
+        "DT",
+        "DATE_AND_TIME",
+        "LD",
+        "LDATE",
+        "LTOD",
+        "LTIME_OF_DAY",
+        "LDT",
+        "LDATE_AND_TIME",
+    ];
+    DATES.iter().any(|d| d.eq_ignore_ascii_case(prefix))
 }
 
 /// Tokens of one file, [`TokenKind::Eof`] last, and what was wrong.

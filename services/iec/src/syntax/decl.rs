@@ -204,6 +204,14 @@ impl Parser<'_> {
                     let d = Diagnostic::new("E0904", self.span(), "access specifiers are not supported yet");
                     self.report(d);
                 }
+                TokenKind::Word(None)
+                    if self.slice().eq_ignore_ascii_case("PERSISTENT")
+                        && matches!(self.peek(1), TokenKind::Word(_)) =>
+                {
+                    let d = Diagnostic::new("E0904", self.span(), "PERSISTENT is not supported")
+                        .help("RETAIN keeps variables over restarts and while the power is off");
+                    self.report(d);
+                }
                 _ => break,
             }
             self.bump();
@@ -302,7 +310,17 @@ impl Parser<'_> {
                 self.expect_kw(Keyword::EndStruct)?;
                 TypeSpecKind::Struct(fields)
             }
-            TokenKind::LParen => self.enum_spec()?,
+            TokenKind::LParen => {
+                let values = self.enum_spec()?;
+                // (red, green) INT
+                match self.kind() {
+                    TokenKind::Word(None) => {
+                        let base = self.ident("a type")?;
+                        self.enum_base(&base, values)
+                    }
+                    _ => values,
+                }
+            }
             TokenKind::Word(Some(Keyword::RefTo)) => {
                 let d = Diagnostic::new("E0904", start, "references (REF_TO) are not supported yet");
                 self.report(d);
@@ -312,7 +330,19 @@ impl Parser<'_> {
             }
             _ => {
                 let name = self.ident("a type")?;
-                if self.kind() == TokenKind::LParen {
+                if self.at_kw(Keyword::To) && is_pointer(&name.text) {
+                    self.bump();
+                    self.type_spec()?;
+                    TypeSpecKind::Named(name)
+                } else if self.kind() == TokenKind::LParen && is_string(&name.text) {
+                    self.skip_to(|k| matches!(k, TokenKind::RParen | TokenKind::Semi));
+                    self.eat(TokenKind::RParen);
+                    TypeSpecKind::Named(name)
+                } else if self.kind() == TokenKind::LParen && self.at_enum_values() {
+                    // INT (red := 1, green := 5)
+                    let values = self.enum_spec()?;
+                    self.enum_base(&name, values)
+                } else if self.kind() == TokenKind::LParen {
                     self.bump();
                     let lo = self.expr()?;
                     self.expect(TokenKind::Range)?;
@@ -329,6 +359,22 @@ impl Parser<'_> {
             }
         };
         Ok(TypeSpec { kind, span: start.to(self.last_span()) })
+    }
+
+    /// At `(name,`, `(name :=` or `(name)`: values, no bounds.
+    fn at_enum_values(&self) -> bool {
+        self.peek(1) == TokenKind::Word(None)
+            && matches!(self.peek(2), TokenKind::Assign | TokenKind::Comma | TokenKind::RParen)
+    }
+
+    /// Enumerations are INT; said aloud it changes nothing, another type is refused.
+    fn enum_base(&mut self, base: &Ident, values: TypeSpecKind) -> TypeSpecKind {
+        if base.text.eq_ignore_ascii_case("INT") {
+            return values;
+        }
+        let text = format!("an enumeration of type {} is not supported: enumerations are INT", base.text);
+        self.report(Diagnostic::new("E0905", base.span, text).help("leave the type out, or write INT"));
+        TypeSpecKind::Error
     }
 
     fn array_spec(&mut self) -> Parsed<TypeSpecKind> {
@@ -509,6 +555,11 @@ impl Parser<'_> {
     pub(super) fn here(&self) -> Span {
         self.span()
     }
+}
+
+/// POINTER TO and REFERENCE TO of other tools.
+fn is_pointer(name: &str) -> bool {
+    name.eq_ignore_ascii_case("POINTER") || name.eq_ignore_ascii_case("REFERENCE")
 }
 
 /// STRING and WSTRING may carry a length in brackets.

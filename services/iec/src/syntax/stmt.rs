@@ -13,6 +13,9 @@ const IL_OPERATORS: &[&str] = &[
     "RETC", "RETCN", "NOT",
 ];
 
+/// Tokens of a CASE label that begins with a name, at most.
+const LABEL_TOKENS: usize = 32;
+
 impl Parser<'_> {
     /// Statements up to a word that `ends` (not consumed), a POU boundary or the end of the file.
     pub(super) fn statements(&mut self, ends: &[Keyword]) -> Vec<Stmt> {
@@ -337,11 +340,29 @@ impl Parser<'_> {
             }
             TokenKind::Word(Some(Keyword::True | Keyword::False)) => true,
             TokenKind::LParen => true,
-            TokenKind::Word(None) => {
-                matches!(self.peek(1), TokenKind::Colon | TokenKind::Comma | TokenKind::Range)
-            }
+            TokenKind::Word(None) => self.name_starts_label(),
             _ => false,
         }
+    }
+
+    /// `name:`, `name, `, `name + 1 ..`, `Color.Red:`: an expression of names and numbers before a label's end.
+    fn name_starts_label(&self) -> bool {
+        for ahead in 1..LABEL_TOKENS {
+            match self.peek(ahead) {
+                TokenKind::Colon | TokenKind::Comma | TokenKind::Range => return true,
+                TokenKind::Word(None | Some(Keyword::Mod))
+                | TokenKind::Dot
+                | TokenKind::Int
+                | TokenKind::BasedInt
+                | TokenKind::Typed
+                | TokenKind::Plus
+                | TokenKind::Minus
+                | TokenKind::Star
+                | TokenKind::Slash => {}
+                _ => return false,
+            }
+        }
+        false
     }
 
     fn for_statement(&mut self, start: Span) -> Parsed<Stmt> {

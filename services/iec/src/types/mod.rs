@@ -56,4 +56,14 @@ impl Type {
             _ => None,
         }
     }
+
+    /// The type of a value read from a variable of this type: a subrange bounds what is stored, not what is
+    /// reckoned with.
+    #[must_use]
+    pub fn of_value(&self) -> Self {
+        match self {
+            Self::Subrange(s) => Self::Elem(s.base),
+            other => other.clone(),
+        }
+    }
 }

@@ -6,12 +6,13 @@ use wasm_encoder::{BlockType, Function, Instruction as I, MemArg, MemArgTarget, 
 
 use super::layout::{Frame, Memory};
 use super::{Indices, val_type};
-use crate::Options;
 use crate::analyze::tables::{Analyzed, InitData, Pou};
 use crate::artifact::{ElemType, TrapId, sys};
+use crate::diagnostic::Diagnostic;
 use crate::ir::{Body, Const};
 use crate::syntax::ast::{PouKind, Section};
 use crate::types::{ElemExt, Type};
+use crate::{Options, limits};
 
 /// A memory operand.
 pub fn mem(offset: u32, align: u32) -> MemArg {
@@ -65,6 +66,9 @@ pub struct Code<'a> {
     pub loops: Vec<Labels>,
 }
 
+/// Offset in a function's code and the statement that begins there.
+pub type Lines = Vec<(u32, u32)>;
+
 /// Parameters of a function: inputs by value, arrays and VAR_IN_OUT by address.
 pub fn params(pou: &Pou) -> Vec<ValType> {
     pou.vars
@@ -115,7 +119,9 @@ impl<'a> Code<'a> {
     }
 
     /// The whole function, and the place of each statement in it.
-    pub fn function(mut self, body: &Body) -> (Function, Vec<(u32, u32)>) {
+    ///
+    /// `Err` when no engine would take it: too many inputs or registers, too much code.
+    pub fn function(mut self, body: &Body) -> Result<(Function, Lines), Box<Diagnostic>> {
         self.assign_slots();
         for ty in &body.temps {
             let local = self.new_local(val_type(*ty));
@@ -126,7 +132,7 @@ impl<'a> Code<'a> {
         self.push_result();
         self.op(I::End);
         let mut function = Function::new_with_locals_types(self.locals.iter().copied());
-        let mut lines: Vec<(u32, u32)> = Vec::new();
+        let mut lines: Lines = Vec::new();
         let mut marks = self.marks.iter().peekable();
         for (i, instruction) in self.out.iter().enumerate() {
             while let Some((at, statement)) = marks.peek() {
@@ -142,7 +148,19 @@ impl<'a> Code<'a> {
             }
             function.instruction(instruction);
         }
-        (function, lines)
+        let registers = self.params as usize + self.locals.len();
+        for (what, has, most) in [
+            ("inputs", self.params as usize, limits::PARAMETERS),
+            ("variables and intermediate values", registers, limits::REGISTERS),
+            ("bytes of code", function.byte_len(), limits::POU_CODE_BYTES),
+        ] {
+            if has > most {
+                let text = format!("`{}` has {has} {what}, at most {most} are possible", self.pou.name.text);
+                let d = Diagnostic::new("E0803", self.pou.name.span, text);
+                return Err(Box::new(d.help("split it into several POUs")));
+            }
+        }
+        Ok((function, lines))
     }
 
     pub fn op(&mut self, i: I<'static>) {

@@ -6,7 +6,7 @@ use super::code::{Code, mem};
 use super::val_type;
 use crate::ModByZero;
 use crate::artifact::{ElemType, TrapId, sys};
-use crate::ir::{BinOp, Call, CallArg, Expr, ExprKind, UnOp};
+use crate::ir::{BinOp, Call, CallArg, Expr, ExprKind, OutputCopy, UnOp};
 use crate::types::ElemExt;
 
 impl Code<'_> {
@@ -452,13 +452,38 @@ impl Code<'_> {
             return;
         };
         self.op(I::Call(index));
-        for o in &call.outputs {
-            let from = self.memory.frames[call.pou as usize].vars.get(&o.var).copied().unwrap_or(0);
+        let from = |c: &Self, o: &OutputCopy| {
+            c.memory.frames[call.pou as usize].vars.get(&o.var).copied().unwrap_or(0)
+        };
+        // A subscript of a target may call the same function and overwrite its outputs: all are fetched first.
+        let held: Vec<u32> = if call.outputs.iter().any(|o| o.target.index.is_some()) {
+            let hold = |o: &OutputCopy| {
+                let local = self.take(val_type(o.ty));
+                self.op(I::I32Const(0));
+                let from = from(self, o);
+                self.load_op(o.ty, from);
+                self.op(I::LocalSet(local));
+                local
+            };
+            call.outputs.iter().map(hold).collect()
+        } else {
+            Vec::new()
+        };
+        for (i, o) in call.outputs.iter().enumerate() {
             self.store_with(o.to, &o.target, |c| {
-                c.op(I::I32Const(0));
-                c.load_op(o.ty, from);
+                match held.get(i) {
+                    Some(local) => c.op(I::LocalGet(*local)),
+                    None => {
+                        c.op(I::I32Const(0));
+                        let from = from(c, o);
+                        c.load_op(o.ty, from);
+                    }
+                }
                 c.output_value(o);
             });
+        }
+        for (o, local) in call.outputs.iter().zip(held) {
+            self.give(val_type(o.ty), local);
         }
     }
 

@@ -174,6 +174,10 @@ fn templates(a: &Analyzed, frames: &mut [Frame], data: &mut Cursor) {
             continue;
         }
         for (i, v) in pou.vars.iter().enumerate() {
+            // Far over the limit, which is told at the end; each look at a large array takes time.
+            if data.0 > limits::MEMORY_BYTES {
+                return;
+            }
             if is_temporary(pou.kind, v)
                 && v.ty.elem().is_none()
                 && v.section != Section::Input

@@ -3,8 +3,8 @@
 use super::layout::Memory;
 use crate::analyze::tables::{Analyzed, Located, Var};
 use crate::artifact::{
-    ARTIFACT_VERSION, Access, AreaKind, DebugMap, ElemType, FunctionLines, Instance, Place, Storage, Symbol,
-    Task, VarKind,
+    ARTIFACT_VERSION, Access, AreaKind, DebugMap, ElemType, Enumeration, FunctionLines, Instance, Place,
+    Storage, Symbol, Task, VarKind,
 };
 use crate::diagnostic::{Diagnostic, Span};
 use crate::syntax::ast::Section;
@@ -55,6 +55,7 @@ pub fn build(
         layout,
         tasks: tasks(a),
         symbols,
+        enumerations: enumerations(a),
         instances,
         files,
         pous: a.tables.pous.iter().map(|p| p.name.text.clone()).collect(),
@@ -65,6 +66,13 @@ pub fn build(
         call_depth: a.call_depth,
         debug: options.debug,
     })
+}
+
+fn enumerations(a: &Analyzed) -> Vec<Enumeration> {
+    let named = |values: &[(crate::syntax::ast::Ident, i64)]| {
+        values.iter().map(|(name, value)| (name.text.clone(), *value)).collect()
+    };
+    a.tables.enums.iter().map(|e| Enumeration { name: e.name.clone(), values: named(&e.values) }).collect()
 }
 
 fn high(reads: &[Access], writes: &[Access], area: AreaKind) -> u32 {
@@ -152,6 +160,7 @@ struct Context<'v> {
     span: Span,
     mapped: bool,
     located: Option<&'v Located>,
+    enumeration: Option<u32>,
 }
 
 impl Builder<'_> {
@@ -168,6 +177,7 @@ impl Builder<'_> {
                 span: v.name.span,
                 mapped: v.mapped.is_some(),
                 located: v.located.as_ref(),
+                enumeration: None,
             };
             self.variable(&v.name.text, &v.ty, *at, cx);
         }
@@ -191,6 +201,7 @@ impl Builder<'_> {
                         span: v.name.span,
                         mapped: false,
                         located,
+                        enumeration: None,
                     };
                     self.variable(&format!("{}.{}", info.name, v.name.text), &v.ty, *at, cx);
                 }
@@ -208,6 +219,7 @@ impl Builder<'_> {
             Type::Error => {}
             Type::Elem(_) | Type::Subrange(_) | Type::Enum(_) => {
                 if let Some(e) = ty.elem() {
+                    let cx = Context { enumeration: enumeration_of(ty), ..cx };
                     self.symbol(path, e, at, Vec::new(), cx);
                 }
             }
@@ -246,6 +258,7 @@ impl Builder<'_> {
             of = &inner.of;
         }
         if let Some(e) = of.elem() {
+            let cx = Context { enumeration: enumeration_of(of), ..cx };
             self.symbol(path, e, at, dims, cx);
             return;
         }
@@ -303,6 +316,7 @@ impl Builder<'_> {
             kind: cx.kind,
             retain: cx.retain,
             address: cx.located.map(|l| l.text.clone()),
+            enumeration: cx.enumeration,
             file: cx.span.file,
             line,
             column,
@@ -327,6 +341,13 @@ impl Builder<'_> {
                 list.push(access);
             }
         }
+    }
+}
+
+fn enumeration_of(ty: &Type) -> Option<u32> {
+    match ty {
+        Type::Enum(index) => Some(*index),
+        _ => None,
     }
 }
 

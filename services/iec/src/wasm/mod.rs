@@ -24,7 +24,7 @@ use crate::diagnostic::{Diagnostic, Span};
 use crate::ir::{self, MathFn};
 use crate::syntax::ast::PouKind;
 use crate::types::ElemExt;
-use crate::{Options, Source};
+use crate::{Options, Source, limits};
 use code::Code;
 use layout::Memory;
 
@@ -133,7 +133,7 @@ pub fn emit(
     for p in &reached {
         let pou = &a.tables.pous[*p as usize];
         let (Some(index), Some(body)) = (indices.pous.get(p), &a.bodies[*p as usize]) else { continue };
-        let (function, marks) = Code::new(a, &memory, &indices, options, *p, None).function(body);
+        let (function, marks) = Code::new(a, &memory, &indices, options, *p, None).function(body)?;
         code.function(&function);
         lines.push(FunctionLines { function: *index, pou: pou.name.text.clone(), lines: marks });
     }
@@ -141,7 +141,7 @@ pub fn emit(
         let pou = &a.tables.pous[inst.pou as usize];
         let empty = ir::Body::default();
         let body = a.bodies[inst.pou as usize].as_ref().unwrap_or(&empty);
-        let (function, marks) = Code::new(a, &memory, &indices, options, inst.pou, Some(i)).function(body);
+        let (function, marks) = Code::new(a, &memory, &indices, options, inst.pou, Some(i)).function(body)?;
         code.function(&function);
         lines.push(FunctionLines { function: instances[i], pou: pou.name.text.clone(), lines: marks });
     }
@@ -212,7 +212,7 @@ fn used_math(a: &Analyzed, reached: &[u32]) -> BTreeSet<(MathFn, bool)> {
     used
 }
 
-/// Runs of bytes that are not zero; short gaps are bridged.
+/// Runs of bytes that are not zero; short gaps are bridged, and all of them when there are too many runs.
 fn data_segments(memory: &Memory) -> DataSection {
     const GAP: usize = 16;
     let mut section = DataSection::new();
@@ -220,6 +220,9 @@ fn data_segments(memory: &Memory) -> DataSection {
     let mut at = 0;
     while let Some(start) = image[at..].iter().position(|b| *b != 0).map(|p| p + at) {
         let mut end = start + 1;
+        if section.len() as usize >= limits::DATA_RUNS {
+            end = image.iter().rposition(|b| *b != 0).map_or(end, |p| p + 1);
+        }
         while let Some(next) = image[end..].iter().take(GAP + 1).position(|b| *b != 0) {
             end += next + 1;
         }

@@ -161,3 +161,14 @@ fn colour_only_when_asked_for() {
     assert!(!d.render(false).contains('\u{1b}'));
     assert!(d.render(true).contains('\u{1b}'));
 }
+
+/// A file of one line must not come out once for each of its errors.
+#[test]
+fn very_long_lines_are_not_shown() {
+    let text = format!("PROGRAM p\nVAR x : INT; END_VAR {} y := x + ä; END_PROGRAM", "x := z; ".repeat(1000));
+    let rendered = compile(&source(&text), &Options::default()).unwrap_err().render(false);
+    assert!(
+        rendered.contains("error[E0302]: there is no variable `z`\n  at test.st:2:27\n  = help: declare it")
+    );
+    assert!(rendered.len() < 100 * 200, "{}", rendered.len());
+}

@@ -5,10 +5,12 @@
 
 mod cases;
 mod diagnostics;
+mod differential;
 mod host;
 mod limits;
 mod map;
 mod operators;
+mod programs;
 mod random;
 
 mod stages;

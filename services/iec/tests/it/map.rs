@@ -229,3 +229,22 @@ fn constants_by_way_of_var_external() {
     assert_eq!(h.artifact.map.symbol("p.b").unwrap().dims, [(0, 7)]);
     assert_eq!(h.artifact.map.symbol("p.x.a").unwrap().dims, [(1, 3)]);
 }
+
+#[test]
+fn values_of_enumerations_have_names() {
+    let h = Host::new(
+        "TYPE Mode : (Off, Manual := 5, Auto); END_TYPE
+         PROGRAM p VAR m : Mode := Manual; all : ARRAY [0..2] OF Mode; n : INT; END_VAR n := n + 1; END_PROGRAM",
+    );
+    let map = &h.artifact.map;
+    let of = |path: &str| {
+        let enumeration = map.symbol(path).unwrap().enumeration;
+        enumeration.map(|e| map.enumerations[e as usize].name.as_str())
+    };
+    assert_eq!((of("p.m"), of("p.all"), of("p.n")), (Some("Mode"), Some("Mode"), None));
+    let values: Vec<(&str, i64)> = map.enumerations[0].values.iter().map(|(n, v)| (n.as_str(), *v)).collect();
+    assert_eq!(values, [("Off", 0), ("Manual", 5), ("Auto", 6)]);
+    // A program without any is the same module as ever.
+    let plain = Host::new("PROGRAM p VAR n : INT; END_VAR n := n + 1; END_PROGRAM");
+    assert!(!serde_json::to_string(&plain.artifact.map).unwrap().contains("enumeration"));
+}

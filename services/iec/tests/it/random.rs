@@ -101,8 +101,46 @@ fn refused(text: &str) -> bool {
     })
 }
 
+/// Cases of a property test: `least`, or PROPTEST_CASES when that is given.
+pub fn cases(least: u32) -> u32 {
+    std::env::var("PROPTEST_CASES").ok().and_then(|n| n.parse().ok()).unwrap_or(least)
+}
+
+/// Compiles with and without hooks; what compiles is valid.
+fn valid_or_refused(text: &str) {
+    for debug in [false, true] {
+        match compile(&source(text), &Options { debug, ..Options::default() }) {
+            Ok(c) => {
+                wasmparser::validate(&c.artifact.wasm).unwrap_or_else(|e| panic!("{e}: {text}"));
+                let _ = c.render_warnings(&source(text), false);
+            }
+            Err(d) => {
+                assert!(d.error_count() > 0, "refused without an error: {text}");
+                assert!(d.items().iter().all(|i| i.code != "E0901"), "{}", d.render(false));
+                let _ = d.render(true);
+            }
+        }
+    }
+}
+
+/// The programs of the other tests, as stock for mutation.
+fn stock() -> &'static [String] {
+    static STOCK: std::sync::OnceLock<Vec<String>> = std::sync::OnceLock::new();
+    STOCK.get_or_init(|| {
+        let dir = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/it/programs");
+        let mut files: Vec<_> = std::fs::read_dir(dir).unwrap().map(|e| e.unwrap().path()).collect();
+        files.sort();
+        let texts = files.iter().map(|f| std::fs::read_to_string(f).unwrap());
+        let mut all: Vec<String> =
+            texts.flat_map(|t| t.split("\n=== ").skip(1).map(str::to_owned).collect::<Vec<_>>()).collect();
+        all.extend(all.clone().iter().map(|t| t.split_once('\n').map_or("", |p| p.1).to_owned()));
+        all.push(SAMPLE.to_owned());
+        all
+    })
+}
+
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 300, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: cases(300), ..ProptestConfig::default() })]
 
     #[test]
     fn integer_expressions(e in tree(), pick in 0_usize..8, vars in prop::array::uniform4(prop_oneof![any::<i64>(), -3_i64..4])) {
@@ -186,6 +224,38 @@ proptest! {
             Ok(c) => { wasmparser::validate(&c.artifact.wasm).unwrap(); }
             Err(d) => prop_assert!(d.error_count() > 0 && !d.render(true).is_empty()),
         }
+    }
+
+    #[test]
+    fn mutated_programs_compile_to_valid_modules_or_not_at_all(
+        which in any::<prop::sample::Index>(), other in any::<prop::sample::Index>(),
+        changes in prop::collection::vec((0_u8..6, any::<prop::sample::Index>(), any::<prop::sample::Index>(), any::<prop::sample::Index>()), 1..6)
+    ) {
+        // Words are replaced, doubled, swapped, left out, or taken from another program.
+        let split = |text: &str| -> Vec<String> {
+            let (tokens, _) = dinrail_iec::lexer::lex(0, text);
+            tokens.iter().map(|t| text[t.start as usize..t.end as usize].to_owned()).collect()
+        };
+        let (mine, theirs): (&String, &String) = (which.get(stock()), other.get(stock()));
+        let mut words = split(mine);
+        let foreign = split(theirs);
+        for (how, a, b, c) in changes {
+            if words.is_empty() { break; }
+            let (i, j) = (a.index(words.len()), b.index(words.len()));
+            match how {
+                0 => { words.remove(i); }
+                1 => words[i] = (*c.get(WORDS)).to_owned(),
+                2 => words.insert(i, (*c.get(WORDS)).to_owned()),
+                3 => words.swap(i, j),
+                4 => words[i] = words[j].clone(),
+                _ => {
+                    let from = c.index(foreign.len());
+                    let to = (from + 12).min(foreign.len());
+                    words.splice(i..i, foreign[from..to].iter().cloned());
+                }
+            }
+        }
+        valid_or_refused(&words.join(" "));
     }
 
     #[test]

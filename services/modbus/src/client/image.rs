@@ -214,12 +214,12 @@ impl WriteTable {
         next_ns
     }
 
-    /// The unit was gone and is back: it gets all values again.
-    pub fn again(&mut self, line: usize, unit: u8, now_ns: u64, mut write: impl FnMut(usize, &[u8])) {
+    /// The unit was gone and is back, or with `None` the connection of all its units: they get all values again.
+    pub fn again(&mut self, line: usize, unit: Option<u8>, now_ns: u64, mut write: impl FnMut(usize, &[u8])) {
         for (i, output) in self.outputs.iter_mut().enumerate() {
             if self.running
                 && output.range.line == line
-                && output.range.unit == unit
+                && unit.is_none_or(|unit| output.range.unit == unit)
                 && output.handed.is_some()
             {
                 output.hand_over(i, now_ns, &mut write);

@@ -102,8 +102,12 @@ fn writes_follow_the_image() {
     assert_eq!(due, [4]);
     // A unit that comes back gets everything.
     let mut again = Vec::new();
-    table.again(0, 1, 0, |i, _| again.push(i));
-    table.again(0, 2, 0, |i, _| again.push(i));
+    table.again(0, Some(1), 0, |i, _| again.push(i));
+    table.again(0, Some(2), 0, |i, _| again.push(i));
+    assert_eq!(again, [0, 1, 2, 3, 4]);
+    again.clear();
+    table.again(0, None, 0, |i, _| again.push(i));
+    table.again(1, None, 0, |i, _| again.push(i));
     assert_eq!(again, [0, 1, 2, 3, 4]);
 }
 
@@ -120,7 +124,7 @@ fn the_safe_state() {
     table.safe(|i, pdu| acts.push((i, pdu.map(<[u8]>::to_vec))));
     assert_eq!(acts, [(0, None), (1, Some(vec![15, 0, 3, 0, 2, 1, 0b10]))]);
     assert_eq!(table.due(u64::MAX, |_, _| panic!("silent")), None);
-    table.again(0, 1, 0, |_, _| panic!("silent"));
+    table.again(0, Some(1), 0, |_, _| panic!("silent"));
     // Back: everything is written, changed or not.
     assert_eq!(image(&mut table, &[1, 0, 3], 0).len(), 2);
 }

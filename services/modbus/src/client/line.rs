@@ -3,9 +3,10 @@
 //! Virtual time in, steps out. A line is a serial port with its units, or one TCP connection. Never more than one
 //! request is in flight. Order: writes first, then jobs and due reads in turns, so that neither starves.
 //!
-//! A unit that does not answer is left alone for growing intervals ("dead"), so that it costs the others little:
-//! after a failure that took `cost` of line time the next try comes after at least [`PROBE_SHARE`] times `cost`, as
-//! long as another unit is alive. While a request is being repeated, the others have their turn, and nothing else is
+//! A unit that does not answer [`DEAD_AFTER`] times in a row, or of which a gateway says so (exceptions 0A, 0B), is left
+//! alone for growing intervals ("dead"), so that it costs the others little: after a try that took `cost` of line time
+//! the next one comes after at least [`PROBE_SHARE`] times `cost`, as long as another unit is alive. Fewer failures cost
+//! their own time and nothing else. While a request is being repeated, the others have their turn, and nothing else is
 //! sent to the silent unit.
 //!
 //! Late answers: on a serial line an answer has no number. What does not fit the request in flight (unit, function,
@@ -31,6 +32,9 @@ use unit::Unit;
 
 /// Most jobs that wait for a line.
 pub const MAX_JOBS: usize = 64;
+/// A unit counts as dead when it has not answered so many tries in a row, repetitions counted, and the last request
+/// is given up: one lost answer is no reason to leave it alone.
+pub const DEAD_AFTER: u32 = 3;
 /// A dead unit is tried again after this many times the line time that its last failure took.
 pub const PROBE_SHARE: u64 = 25;
 /// Longest interval between tries of a unit that has the line for itself.
@@ -39,6 +43,13 @@ pub const LONE_PROBE_NS: u64 = 5_000_000_000;
 const WRITES_IN_A_ROW: u32 = 8;
 /// Shortest and longest pause after the port or connection failed.
 const LINK_PAUSE_NS: (u64, u64) = (100_000_000, 5_000_000_000);
+
+/// Whether a gateway says by this exception that it does not reach the unit: then the unit has not answered.
+fn is_of_gateway(exception: Option<u8>) -> bool {
+    use crate::protocol::pdu::Exception::{GatewayPathUnavailable, GatewayTargetFailedToRespond};
+    let codes = [GatewayPathUnavailable.code(), GatewayTargetFailedToRespond.code()];
+    exception.is_some_and(|code| codes.contains(&code))
+}
 
 struct Slot {
     unit: usize,
@@ -99,6 +110,10 @@ pub struct Line {
     reset: bool,
     link_until_ns: u64,
     link_level: u32,
+    /// The port or connection did not work when it was last used.
+    link_down: bool,
+    /// A unit has gone dead or come back.
+    news: bool,
     writes_in_a_row: u32,
     job_had_turn: bool,
     counters: LineCounters,
@@ -120,6 +135,8 @@ impl Line {
             reset: false,
             link_until_ns: 0,
             link_level: 0,
+            link_down: false,
+            news: false,
             writes_in_a_row: 0,
             job_had_turn: false,
             counters: LineCounters::default(),
@@ -155,7 +172,7 @@ impl Line {
         if let Some(slot) = self.slots.get_mut(slot) {
             slot.pdu = Pdu::new(pdu);
             slot.changed = true;
-            slot.due_ns.get_or_insert(now_ns);
+            slot.due_ns = Some(slot.due_ns.map_or(now_ns, |due_ns| due_ns.min(now_ns)));
         }
     }
 
@@ -223,7 +240,7 @@ impl Line {
     pub fn units(&self) -> impl Iterator<Item = UnitView> + '_ {
         self.units.iter().map(|u| UnitView {
             unit: u.number,
-            state: u.state,
+            state: if self.link_down { UnitState::NoConnection } else { u.state },
             counters: u.counters,
             last_exception: u.last_exception,
             last_rtt_ns: u.last_rtt_ns,
@@ -231,7 +248,28 @@ impl Line {
         })
     }
 
-    /// State of a unit.
+    /// A unit that has gone dead (`true`) or has come back since it was last told of; to be called until `None`.
+    pub fn unit_news(&mut self) -> Option<(u8, bool)> {
+        if !self.news {
+            return None;
+        }
+        for unit in &mut self.units {
+            let dead = unit.state == UnitState::Dead;
+            if unit.told_dead != dead {
+                unit.told_dead = dead;
+                return Some((unit.number, dead));
+            }
+        }
+        self.news = false;
+        None
+    }
+
+    /// Whether the port or connection did not work when it was last used.
+    pub fn is_link_down(&self) -> bool {
+        self.link_down
+    }
+
+    /// State of a unit, whatever the port or connection does.
     pub fn unit_state(&self, unit: u8) -> UnitState {
         self.units.get(usize::from(self.index[usize::from(unit)])).map_or(UnitState::Unknown, |u| u.state)
     }
@@ -257,6 +295,7 @@ impl Line {
             return;
         }
         flight.sent_ns = now_ns;
+        self.link_down = false;
         let unit = &self.units[flight.unit];
         match self.settings.turnaround_ns.filter(|_| unit.number == 0) {
             Some(turnaround_ns) => {
@@ -302,12 +341,19 @@ impl Line {
             Fit::Answer => {}
             Fit::Exception(code) => {
                 asked.counters.exceptions += 1;
-                asked.last_exception = Some(code);
+                asked.last_exception = Some((code, flight.pdu.get().first().copied().unwrap_or(0)));
             }
+        }
+        let exception = match fitting {
+            Fit::Exception(code) => Some(code),
+            _ => None,
+        };
+        if is_of_gateway(exception) && matches!(flight.origin, Origin::Slot(_)) {
+            return self.unreachable(now_ns);
         }
         let len = pdu.len().min(self.answer.len());
         self.answer[..len].copy_from_slice(&pdu[..len]);
-        self.succeed(len, now_ns);
+        self.succeed(len, exception, now_ns);
     }
 
     fn late(&mut self, unit: u8, pdu: &[u8]) {

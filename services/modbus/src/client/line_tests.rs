@@ -228,6 +228,119 @@ fn a_broken_link_pauses_and_ends_jobs_at_once() {
 }
 
 #[test]
+fn a_write_outlives_a_broken_link() {
+    let mut line = Line::new(TCP, unit(100, 3));
+    let write = line.add_slot(1, SlotKind::Write, &[], None);
+    line.set_write(write, &[6, 0, 0, 0, 1], 0);
+    assert_eq!(steps(&mut line, 0)[0], "send 1 [06, 00, 00, 00, 01]");
+    line.link_failed(MS);
+    assert_eq!(steps(&mut line, MS), ["failed Slot(0) Link", "wait 101"]);
+    // Its newest value goes out when the link stands again, unless it was forgotten meanwhile.
+    line.set_write(write, &[6, 0, 0, 0, 2], 50 * MS);
+    assert_eq!(steps(&mut line, 101 * MS)[0], "send 1 [06, 00, 00, 00, 02]");
+    line.drop_write(write);
+    line.link_failed(102 * MS);
+    assert_eq!(steps(&mut line, 102 * MS)[0], "failed Slot(0) Link");
+    assert_eq!(steps(&mut line, 1000 * MS), ["wait"]);
+}
+
+#[test]
+fn a_write_that_is_refused_for_now_is_repeated_and_one_refused_for_good_is_not() {
+    for (code, again) in [(1, false), (2, false), (3, false), (4, true), (5, false), (6, true)] {
+        let mut line = Line::new(TCP, unit(100, 0));
+        let write = line.add_slot(1, SlotKind::Write, &[], None);
+        line.set_write(write, &[6, 0, 0, 0, 1], 0);
+        steps(&mut line, 0);
+        line.sent(0);
+        line.answer(1, &[0x86, code], MS);
+        let wait = if again { "wait 1001" } else { "wait" };
+        assert_eq!(steps(&mut line, MS), [format!("done Slot(0) [86, {code:02X}]"), wait.to_owned()]);
+        assert_eq!(line.unit_state(1), UnitState::Ok);
+        // A new value does not wait for that.
+        line.set_write(write, &[6, 0, 0, 0, 2], 500 * MS);
+        assert_eq!(steps(&mut line, 500 * MS)[0], "send 1 [06, 00, 00, 00, 02]");
+        line.sent(500 * MS);
+        // Forgotten while it was under way.
+        line.drop_write(write);
+        line.answer(1, &[0x86, code], 501 * MS);
+        assert_eq!(steps(&mut line, 501 * MS)[1], "wait");
+    }
+}
+
+#[test]
+fn what_a_gateway_says_of_a_unit_is_no_answer_of_the_unit() {
+    for code in [0x0A, 0x0B] {
+        let mut line = Line::new(TCP, unit(100, 1));
+        line.add_slot(1, SlotKind::Read, &read(0, 1), Some(0));
+        let write = line.add_slot(1, SlotKind::Write, &[], None);
+        line.set_write(write, &[6, 0, 0, 0, 1], 0);
+        steps(&mut line, 0);
+        line.sent(0);
+        line.answer(1, &[0x86, code], 50 * MS);
+        // The connection stays, nothing is repeated at once, and the write is kept.
+        assert_eq!(steps(&mut line, 50 * MS), ["failed Slot(1) NoAnswer", "wait 1050"]);
+        let view = line.units().next().unwrap();
+        assert_eq!(
+            (view.state, view.counters.timeouts, view.last_exception),
+            (UnitState::Dead, 0, Some(code))
+        );
+        // A job gets the exception as it is, and changes nothing about the unit.
+        line.push_job(1, 1, &read(0, 1), u64::MAX, false).unwrap();
+        steps(&mut line, 60 * MS);
+        line.sent(60 * MS);
+        line.answer(1, &[0x83, code], 70 * MS);
+        assert_eq!(
+            steps(&mut line, 70 * MS),
+            [format!("done Job(1) [83, {code:02X}]"), "wait 1050".to_owned()]
+        );
+        assert_eq!(line.unit_state(1), UnitState::Dead);
+        assert_eq!(steps(&mut line, 1050 * MS)[0], "send 1 [06, 00, 00, 00, 01]");
+        line.sent(1050 * MS);
+        line.answer(1, &[6, 0, 0, 0, 1], 1060 * MS);
+        assert_eq!(
+            steps(&mut line, 1060 * MS)[..2],
+            ["done Slot(1) [06, 00, 00, 00, 01]", "send 1 [03, 00, 00, 00, 01]"]
+        );
+    }
+}
+
+#[test]
+fn a_write_forgotten_while_it_was_under_way_does_not_hold_up_its_unit() {
+    let mut line = Line::new(SERIAL, unit(100, 3));
+    line.add_slot(1, SlotKind::Read, &read(0, 1), Some(50 * MS));
+    let write = line.add_slot(1, SlotKind::Write, &[], None);
+    line.set_write(write, &[6, 0, 0, 0, 1], 0);
+    assert_eq!(steps(&mut line, 0)[0], "send 1 [06, 00, 00, 00, 01]");
+    line.sent(0);
+    // The plc stops, and the unit does not answer this one.
+    line.drop_write(write);
+    assert_eq!(
+        steps(&mut line, 100 * MS),
+        ["failed Slot(1) NoAnswer", "send 1 [03, 00, 00, 00, 01]", "wait 2100"]
+    );
+    assert_eq!(line.unit_state(1), UnitState::Unknown);
+}
+
+#[test]
+fn the_most_retries_there_can_be_end() {
+    let mut line = Line::new(SERIAL, unit(1, u8::MAX));
+    line.push_job(1, 1, &read(0, 1), u64::MAX, false).unwrap();
+    let (mut now_ns, mut sent) = (0, 0);
+    let failure = loop {
+        match line.step(now_ns) {
+            Step::Send { .. } => {
+                sent += 1;
+                line.sent(now_ns);
+            }
+            Step::Wait(until) => now_ns = until.unwrap(),
+            Step::Done { result, .. } => break result.err(),
+            Step::Reset => panic!("a serial line has no connection"),
+        }
+    };
+    assert_eq!((failure, sent), (Some(Failure::NoAnswer), 255));
+}
+
+#[test]
 fn jobs_of_a_gateway_fail_fast_at_a_dead_unit() {
     let mut line = Line::new(SERIAL, unit(100, 0));
     let ask = |line: &mut Line, id, unit, now_ns: u64| {
@@ -252,9 +365,17 @@ fn jobs_of_a_gateway_fail_fast_at_a_dead_unit() {
     assert!(ask(&mut line, 6, 2, 2621 * MS)[0].starts_with("send"));
 }
 
-/// Answers per unit after `span_ns` on a line where a request takes `wire_ns`, and `dead` never answers.
-fn rates(units: u8, dead: Option<u8>, timeout_ms: u64, wire_ns: u64, span_ns: u64) -> BTreeMap<u8, u64> {
-    let mut line = Line::new(SERIAL, unit(timeout_ms, 1));
+/// Answers per unit after `span_ns` on a line where a request takes `wire_ns`, and `dead` never answers; or a gateway
+/// says so after half a timeout.
+fn rates(
+    units: u8,
+    dead: Option<u8>,
+    by_gateway: bool,
+    timeout_ms: u64,
+    wire_ns: u64,
+    span_ns: u64,
+) -> BTreeMap<u8, u64> {
+    let mut line = Line::new(if by_gateway { TCP } else { SERIAL }, unit(timeout_ms, 1));
     for number in 1..=units {
         line.set_unit(number, unit(timeout_ms, 1));
         line.add_slot(number, SlotKind::Read, &read(0, 10), Some(0));
@@ -269,6 +390,10 @@ fn rates(units: u8, dead: Option<u8>, timeout_ms: u64, wire_ns: u64, span_ns: u6
                     now_ns += wire_ns;
                     spent_ns += wire_ns;
                     line.answer(unit, &answer_to(&pdu), now_ns);
+                } else if by_gateway {
+                    now_ns += timeout_ms * MS / 2;
+                    spent_ns += timeout_ms * MS / 2;
+                    line.answer(unit, &[0x83, 0x0B], now_ns);
                 }
             }
             Step::Wait(until) => {
@@ -277,7 +402,7 @@ fn rates(units: u8, dead: Option<u8>, timeout_ms: u64, wire_ns: u64, span_ns: u6
                 now_ns = until_ns;
             }
             Step::Done { .. } => {}
-            Step::Reset => panic!("a serial line has no connection"),
+            Step::Reset => panic!("nothing comes late"),
         }
     }
     // Time is spent on answered requests or lost on the dead unit, and on nothing else.
@@ -292,17 +417,19 @@ fn a_dead_unit_among_ten_costs_the_other_nine_less_than_5_percent() {
     // FC3 x 10 at 9600 and 115200 baud and at 19200 with short timeouts; ten minutes.
     for (timeout_ms, wire_ns) in [(1000, 45_800_000), (1000, 6_700_000), (200, 22_900_000)] {
         let span_ns = 600_000 * MS;
-        let nine = rates(9, None, timeout_ms, wire_ns, span_ns);
-        let with_dead = rates(10, Some(10), timeout_ms, wire_ns, span_ns);
-        assert_eq!(with_dead[&10], 0);
-        for number in 1..=9 {
-            let (alone, beside) = (nine[&number] as f64, with_dead[&number] as f64);
-            assert!(beside > 0.95 * alone, "unit {number}: {beside} of {alone} at {timeout_ms} ms");
+        for by_gateway in [false, true] {
+            let nine = rates(9, None, by_gateway, timeout_ms, wire_ns, span_ns);
+            let with_dead = rates(10, Some(10), by_gateway, timeout_ms, wire_ns, span_ns);
+            assert_eq!(with_dead[&10], 0);
+            for number in 1..=9 {
+                let (alone, beside) = (nine[&number] as f64, with_dead[&number] as f64);
+                assert!(beside > 0.95 * alone, "unit {number}: {beside} of {alone} at {timeout_ms} ms");
+            }
+            // All alike.
+            let (least, most) =
+                (1..=9).fold((u64::MAX, 0), |(l, m), n| (l.min(with_dead[&n]), m.max(with_dead[&n])));
+            assert!(most - least <= 1, "{with_dead:?}");
         }
-        // All alike.
-        let (least, most) =
-            (1..=9).fold((u64::MAX, 0), |(l, m), n| (l.min(with_dead[&n]), m.max(with_dead[&n])));
-        assert!(most - least <= 1, "{with_dead:?}");
     }
 }
 
@@ -344,6 +471,8 @@ enum Fate {
     Garbage(Vec<u8>),
     OtherUnit,
     Exception,
+    /// A gateway does not reach the unit.
+    Unreachable,
     Unsent,
 }
 
@@ -357,6 +486,7 @@ fn fates() -> impl Strategy<Value = Vec<Fate>> {
             1 => prop::collection::vec(any::<u8>(), 0..9).prop_map(Fate::Garbage),
             1 => Just(Fate::OtherUnit),
             1 => Just(Fate::Exception),
+            1 => Just(Fate::Unreachable),
             1 => Just(Fate::Unsent),
         ],
         1..60,
@@ -367,7 +497,9 @@ proptest! {
     /// Whatever the line does: one request in flight at a time, every job ends exactly once, and an answer told is
     /// the one to its own request.
     #[test]
-    fn every_job_ends_with_its_own_answer_or_an_error(fates in fates(), serial: bool, copies: bool, retries in 0u8..3, jobs in 1u64..40) {
+    fn every_job_ends_with_its_own_answer_or_an_error(
+        fates in fates(), serial: bool, copies: bool, forgets: bool, retries in 0u8..3, jobs in 1u64..40,
+    ) {
         let mut line = Line::new(if serial { SERIAL } else { TCP }, unit(100, retries));
         line.add_slot(1, SlotKind::Read, &read(100, 2), Some(70 * MS));
         line.add_slot(2, SlotKind::Read, &read(200, 2), Some(0));
@@ -408,7 +540,8 @@ proptest! {
                         if let Origin::Job(id) = origin {
                             if let Ok(pdu) = result {
                                 let own = answer_to(&asked[&id]);
-                                prop_assert!(pdu == own || pdu == [0x83, 4], "job {id}: {pdu:02X?}");
+                                let refused = pdu == [0x83, 4] || pdu == [0x83, 0x0B];
+                                prop_assert!(pdu == own || refused, "job {id}: {pdu:02X?}");
                             }
                             prop_assert!(ended.insert(id, result.is_ok()).is_none(), "job {id} ended twice");
                         }
@@ -430,6 +563,9 @@ proptest! {
                     line.answer(unit, &pdu, now_ns);
                 }
                 line.sent(now_ns);
+                if forgets && next.is_multiple_of(3) {
+                    line.drop_write(write);
+                }
                 in_flight = Some(now_ns + 100 * MS);
                 let right = answer_to(&pdu);
                 match fate {
@@ -453,6 +589,7 @@ proptest! {
                     }
                     Fate::OtherUnit => coming.push((now_ns + 5 * MS, unit + 7, right)),
                     Fate::Exception => coming.push((now_ns + 5 * MS, unit, vec![pdu[0] | 0x80, 4])),
+                    Fate::Unreachable => coming.push((now_ns + 5 * MS, unit, vec![pdu[0] | 0x80, 0x0B])),
                 }
                 continue;
             }
@@ -469,5 +606,37 @@ proptest! {
             }
         }
         prop_assert_eq!(ended.len() as u64, jobs);
+        // Whatever came before: when everything answers, everybody is asked again, and each job gets its answer.
+        let (end_ns, mut read_units, mut done) = (now_ns + 200_000 * MS, BTreeMap::new(), 0);
+        // Behind the longest pause of a link that did not work.
+        let mut coming = 1..=4;
+        let begin_ns = now_ns + 6_000 * MS;
+        while now_ns < end_ns {
+            if now_ns >= begin_ns {
+                for unit in coming.by_ref() {
+                    line.push_job(1000 + u64::from(unit), unit, &read(7, 1), u64::MAX, false).unwrap();
+                }
+            }
+            match line.step(now_ns) {
+                Step::Send { unit, pdu, .. } => {
+                    let right = answer_to(pdu);
+                    line.sent(now_ns);
+                    now_ns += 50 * MS;
+                    line.answer(unit, &right, now_ns);
+                }
+                Step::Done { origin: Origin::Job(id), result, .. } if id > 1000 => {
+                    prop_assert_eq!(result, Ok(&[3, 2, 0, 7][..]));
+                    done += 1;
+                }
+                Step::Done { origin: Origin::Slot(_), unit, result: Ok(_) } => {
+                    *read_units.entry(unit).or_insert(0u32) += 1;
+                }
+                // What was in flight at the end of misfortune.
+                Step::Done { .. } | Step::Reset => {}
+                Step::Wait(until) => now_ns = now_ns.max(until.unwrap_or(end_ns)),
+            }
+        }
+        prop_assert_eq!(done, 4);
+        prop_assert!(read_units.get(&1).is_some_and(|n| *n > 10) && read_units.get(&2).is_some_and(|n| *n > 10));
     }
 }

@@ -2,13 +2,16 @@
 //!
 //! A link is a task with two queues: orders in, reports out. It connects when it is first ordered to send, never
 //! repeats anything and knows no timeout but that of connecting; when to give up on an answer is the line's business,
-//! which then orders the connection dropped.
+//! which then orders the connection dropped. A connection that the server has ended while nothing was asked (most do so
+//! after a while) is made anew before the next request, which would be lost on it.
 
 use super::plan::Target;
 use crate::protocol::client_fit::{Length, length};
 use crate::protocol::pdu::{COIL_ON, EXCEPTION_BIT, MAX_PDU};
 use crate::protocol::rtu;
+use rustix::net::{RecvFlags, recv};
 use std::net::SocketAddr;
+use std::os::fd::{AsFd, OwnedFd};
 use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -28,8 +31,10 @@ pub enum Order {
 /// What a link tells.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Report {
-    /// The connection stands.
-    Connected,
+    /// The connection stands; `anew`: the server had ended the one before.
+    Connected {
+        anew: bool,
+    },
     /// The request is on its way.
     Sent,
     Answer {
@@ -56,7 +61,7 @@ impl Link {
     pub fn start(line: usize, target: &Target, connect_timeout: Duration, reports: Reports) -> Option<Self> {
         // One request is in flight, so a queue never holds more than an order to send and one to drop.
         let (orders, inbox) = mpsc::unbounded_channel();
-        let task = Task { line, seq: 0, orders: inbox, reports, connect_timeout };
+        let task = Task { line, seq: 0, orders: inbox, next: None, reports, connect_timeout, ended: false };
         match *target {
             Target::Tcp(address) => tokio::task::spawn_local(task.tcp(address)),
             Target::RtuOverTcp(address) => tokio::task::spawn_local(task.rtu(address)),
@@ -84,13 +89,47 @@ struct Task {
     line: usize,
     seq: u64,
     orders: mpsc::UnboundedReceiver<Order>,
+    /// An order to send that came while another one was under way.
+    next: Option<Order>,
     reports: Reports,
     connect_timeout: Duration,
+    /// The server has ended the connection that stood last.
+    ended: bool,
+}
+
+/// How a connection that is not used at the moment is.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Idle {
+    Well,
+    /// Something came that nobody asked for.
+    Unasked,
+    /// The other side has ended it.
+    Ended,
+}
+
+fn idle(stream: impl AsFd) -> Idle {
+    match recv(stream, &mut [0_u8; 1], RecvFlags::PEEK | RecvFlags::DONTWAIT) {
+        Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => Idle::Well,
+        Ok((1.., _)) => Idle::Unasked,
+        Ok(_) | Err(_) => Idle::Ended,
+    }
 }
 
 impl Task {
     fn tell(&self, report: Report) {
         let _ = self.reports.send((self.line, self.seq, report));
+    }
+
+    async fn order(&mut self) -> Option<Order> {
+        match self.next.take() {
+            Some(order) => Some(order),
+            None => self.orders.recv().await,
+        }
+    }
+
+    /// An order came while another one was under way, which is given up.
+    fn interrupted(&mut self, order: Option<Order>) {
+        self.next = order.filter(|order| matches!(order, Order::Send { .. }));
     }
 
     /// Connects; `None`: told why not, or ordered to drop it.
@@ -103,11 +142,15 @@ impl Task {
         };
         let connected = tokio::select! {
             connected = tokio::time::timeout(self.connect_timeout, attempt) => connected,
-            _ = self.orders.recv() => return None,
+            order = self.orders.recv() => {
+                self.interrupted(order);
+                return None;
+            }
         };
         match connected {
             Ok(Ok(stream)) => {
-                self.tell(Report::Connected);
+                let anew = std::mem::take(&mut self.ended);
+                self.tell(Report::Connected { anew });
                 Some(stream)
             }
             Ok(Err(e)) => {
@@ -125,26 +168,41 @@ impl Task {
     }
 
     async fn tcp(mut self, address: SocketAddr) {
-        let mut context: Option<Context> = None;
-        while let Some(order) = self.orders.recv().await {
+        // With a second descriptor of the connection: tokio-modbus does not show its own.
+        let mut connection: Option<(Context, OwnedFd)> = None;
+        while let Some(order) = self.order().await {
             let Order::Send { seq, unit, pdu } = order else {
-                context = None;
+                connection = None;
                 continue;
             };
             self.seq = seq;
-            if context.is_none() {
-                let Some(stream) = self.connect(address).await else { continue };
-                context = Some(attach_slave(stream, Slave(unit)));
+            if let Some((_, fd)) = &connection {
+                let idle = idle(fd);
+                self.ended |= idle == Idle::Ended;
+                if idle != Idle::Well {
+                    connection = None;
+                }
             }
-            let Some(open) = &mut context else { continue };
+            if connection.is_none() {
+                let Some(stream) = self.connect(address).await else { continue };
+                match stream.as_fd().try_clone_to_owned() {
+                    Ok(fd) => connection = Some((attach_slave(stream, Slave(unit)), fd)),
+                    Err(e) => {
+                        self.tell(Report::Failed(format!("{address}: {e}")));
+                        continue;
+                    }
+                }
+            }
+            let Some((open, _)) = &mut connection else { continue };
             open.set_slave(Slave(unit));
             let Some((&function, data)) = pdu.split_first() else { continue };
             self.tell(Report::Sent);
             let answer = tokio::select! {
                 answer = open.call(Request::Custom(function, data.into())) => answer,
                 // Ordered to drop it, or the service ends.
-                _ = self.orders.recv() => {
-                    context = None;
+                order = self.orders.recv() => {
+                    self.interrupted(order);
+                    connection = None;
                     continue;
                 }
             };
@@ -166,7 +224,8 @@ impl Task {
                     self.tell(Report::Answer { unit, pdu });
                 }
                 Err(e) => {
-                    context = None;
+                    connection = None;
+                    self.ended |= matches!(e, tokio_modbus::Error::Transport(_));
                     self.tell(Report::Failed(format!("{address}: {}", in_words(&e))));
                 }
             }
@@ -176,21 +235,27 @@ impl Task {
     async fn rtu(mut self, address: SocketAddr) {
         let mut connection: Option<TcpStream> = None;
         let mut buffer = Vec::with_capacity(2 * rtu::MAX_ADU);
-        while let Some(order) = self.orders.recv().await {
+        while let Some(order) = self.order().await {
             let Order::Send { seq, unit, pdu } = order else {
                 connection = None;
                 continue;
             };
             self.seq = seq;
+            if let Some(stream) = &connection {
+                // What came unasked is no answer.
+                let mut waste = [0_u8; 512];
+                while matches!(recv(stream, &mut waste, RecvFlags::DONTWAIT), Ok((1.., _))) {}
+                if idle(stream) == Idle::Ended {
+                    self.ended = true;
+                    connection = None;
+                }
+            }
             if connection.is_none() {
                 connection = self.connect(address).await;
             }
             let Some(stream) = &mut connection else { continue };
             let mut frame = [0; rtu::MAX_ADU];
             let len = rtu::encode(unit, &pdu, &mut frame);
-            // What came unasked is no answer.
-            let mut waste = [0; 512];
-            while matches!(stream.try_read(&mut waste), Ok(1..)) {}
             buffer.clear();
             let answered = match stream.write_all(&frame[..len]).await {
                 Ok(()) => {
@@ -206,6 +271,7 @@ impl Task {
             if let Err(why) = answered {
                 connection = None;
                 if let Some(e) = why {
+                    self.ended = true;
                     self.tell(Report::Failed(format!("{address}: {e}")));
                 }
             }
@@ -224,7 +290,10 @@ impl Task {
         loop {
             let read = tokio::select! {
                 read = stream.read(&mut some) => read,
-                _ = self.orders.recv() => return Err(None),
+                order = self.orders.recv() => {
+                    self.interrupted(order);
+                    return Err(None);
+                }
             };
             match read {
                 Ok(0) => return Err(Some(std::io::Error::other("the server closed the connection"))),

@@ -58,3 +58,92 @@ proptest! {
         let _ = find_answer(bytes.first().copied().unwrap_or(0), &request, &bytes);
     }
 }
+
+/// A server that ends every connection after one answer, without being asked.
+async fn one_answer_each(listener: tokio::net::TcpListener, rtu: bool) {
+    while let Ok((mut stream, _)) = listener.accept().await {
+        let mut bytes = [0; 64];
+        let n = stream.read(&mut bytes).await.unwrap();
+        let answer = if rtu {
+            frame(bytes[0], &[3, 2, 0, 7])
+        } else {
+            [&bytes[..4], &[0, 5, bytes[6], 3, 2, 0, 7]].concat()
+        };
+        assert!(n >= 8);
+        stream.write_all(&answer).await.unwrap();
+    }
+}
+
+#[test]
+fn a_connection_that_the_server_ended_meanwhile_costs_no_request() {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    for over_rtu in [false, true] {
+        let test = async {
+            let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+            let address = listener.local_addr().unwrap();
+            let target = if over_rtu { Target::RtuOverTcp(address) } else { Target::Tcp(address) };
+            tokio::task::spawn_local(one_answer_each(listener, over_rtu));
+            let (reports_in, mut reports) = mpsc::unbounded_channel();
+            let mut link = Link::start(0, &target, Duration::from_secs(20), reports_in).unwrap();
+            let mut told = Vec::new();
+            for _ in 0..3 {
+                link.send(5, &[3, 0, 0, 0, 1]);
+                loop {
+                    let (_, seq, report) = reports.recv().await.unwrap();
+                    assert!(link.is_current(seq));
+                    let answered = matches!(report, Report::Answer { .. });
+                    told.push(report);
+                    if answered {
+                        break;
+                    }
+                }
+                // Until the end of the connection has arrived, which nothing tells.
+                tokio::time::sleep(Duration::from_millis(50)).await;
+            }
+            told
+        };
+        let told = tokio::task::LocalSet::new()
+            .block_on(&runtime, async { tokio::time::timeout(Duration::from_secs(30), test).await })
+            .expect("the test hangs");
+        let answer = || Report::Answer { unit: 5, pdu: vec![3, 2, 0, 7] };
+        let round = |anew| [Report::Connected { anew }, Report::Sent, answer()];
+        let expected: Vec<Report> = [false, true, true].into_iter().flat_map(round).collect();
+        assert_eq!(told, expected, "RTU: {over_rtu}");
+    }
+}
+
+#[test]
+fn an_order_that_comes_while_another_is_under_way_is_not_lost() {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    for over_rtu in [false, true] {
+        let test = async {
+            let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+            let address = listener.local_addr().unwrap();
+            let target = if over_rtu { Target::RtuOverTcp(address) } else { Target::Tcp(address) };
+            // Its first connection is never answered.
+            let deaf = tokio::task::spawn_local(async move {
+                let held = listener.accept().await.unwrap();
+                one_answer_each(listener, over_rtu).await;
+                drop(held);
+            });
+            let (reports_in, mut reports) = mpsc::unbounded_channel();
+            let mut link = Link::start(0, &target, Duration::from_secs(20), reports_in).unwrap();
+            link.send(5, &[3, 0, 0, 0, 1]);
+            assert_eq!(reports.recv().await.unwrap().2, Report::Connected { anew: false });
+            assert_eq!(reports.recv().await.unwrap().2, Report::Sent);
+            link.send(5, &[3, 0, 0, 0, 1]);
+            let mut told = Vec::new();
+            while !matches!(told.last(), Some(Report::Answer { .. })) {
+                let (_, seq, report) = reports.recv().await.unwrap();
+                assert!(link.is_current(seq));
+                told.push(report);
+            }
+            deaf.abort();
+            told
+        };
+        let told = tokio::task::LocalSet::new()
+            .block_on(&runtime, async { tokio::time::timeout(Duration::from_secs(30), test).await })
+            .expect("the test hangs");
+        assert_eq!(told[..2], [Report::Connected { anew: false }, Report::Sent], "RTU: {over_rtu}");
+    }
+}

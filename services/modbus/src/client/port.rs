@@ -13,6 +13,9 @@ pub const START_LIMIT_NS: u64 = 2_000_000_000;
 pub const SEND_LIMIT_NS: u64 = 6_000_000_000;
 /// Longest frame: ASCII, 513 characters.
 const MAX_FRAME: usize = ascii::MAX_ADU;
+/// Bytes in front of an answer that do not count: on a line that nothing holds idle, the switching of a direction makes
+/// one or two. Only a master may do so: it knows what answer it waits for.
+const GLITCH: usize = 2;
 /// Chunks taken at a time.
 const TAKE: usize = 256;
 
@@ -60,7 +63,7 @@ impl SerialPort {
     pub fn send(&mut self, unit: u8, pdu: &[u8], now_ns: u64) -> Result<(), SendError> {
         let header = SerialChunk {
             first_t_ns: now_ns.saturating_add(START_LIMIT_NS),
-            flags: serial_flag::END,
+            flags: serial_flag::END | serial_flag::EXPECT_ANSWER,
             ..SerialChunk::default()
         };
         let seq = if self.assembler.ascii {
@@ -149,9 +152,10 @@ impl Assembler {
                 Err(_) => take(Incoming::Garbage),
             }
         } else {
-            match rtu::decode(frame) {
-                Ok((unit, pdu)) => take(Incoming::Frame { unit, pdu, t_ns }),
-                Err(_) => take(Incoming::Garbage),
+            let found = (0..=GLITCH).find_map(|skip| rtu::decode(frame.get(skip..)?).ok());
+            match found {
+                Some((unit, pdu)) => take(Incoming::Frame { unit, pdu, t_ns }),
+                None => take(Incoming::Garbage),
             }
         }
     }
@@ -183,6 +187,14 @@ mod tests {
         assert!(told(&mut line, 0, &[1; 600]).is_empty());
         assert_eq!(told(&mut line, serial_flag::END, &[]), ["Garbage"]);
         assert_eq!(told(&mut line, serial_flag::END, &frame[..len]), whole);
+        // What the switching of a direction puts in front of it.
+        for (glitch, answer) in
+            [(&[0xFF][..], &whole[..]), (&[0, 0xFF], &whole[..]), (&[0, 0, 0], &["Garbage"])]
+        {
+            let bytes = [glitch, &frame[..len]].concat();
+            assert_eq!(told(&mut line, serial_flag::END, &bytes), answer);
+        }
+        assert_eq!(told(&mut line, serial_flag::END, &[0xFF]), ["Garbage"]);
         let mut frame = [0; ascii::MAX_ADU];
         let len = ascii::encode(5, &[3, 2, 0, 7], &mut frame);
         let mut line = Assembler::new(true);

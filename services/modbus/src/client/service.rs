@@ -210,12 +210,14 @@ impl Service {
         }
         let now_ns = clock::mono_ns();
         match report {
-            Report::Connected => {
+            Report::Connected { anew } => {
                 runner.connected = true;
                 if runner.trouble.take().is_some() {
                     let message = format!("connected to {} again", runner.plan.target);
                     self.tell(EventKind::BusState, Level::Info, message);
                 }
+                self.runners[line].rewrite.wanted |= anew;
+                self.rewrite(line, now_ns);
             }
             Report::Sent => runner.line.sent(now_ns),
             Report::Answer { unit, pdu } => runner.line.answer(unit, &pdu, now_ns),
@@ -284,8 +286,12 @@ impl Service {
 
     fn beat(&mut self, beats: u32) {
         self.ctx.beat();
-        if self.published.is_due(clock::mono_ns()) {
+        let now_ns = clock::mono_ns();
+        if self.published.is_due(now_ns) {
             self.publish(false);
+        }
+        for line in 0..self.runners.len() {
+            self.rewrite(line, now_ns);
         }
         if beats.is_multiple_of(STATUS_BEATS) {
             self.status();

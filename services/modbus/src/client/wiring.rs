@@ -121,14 +121,30 @@ pub(crate) fn check_serial(me: &str, key: &str, service: &str, ascii: bool, stac
         };
         return vec![Finding::error(me, key, format!("there is no serial service '{service}'"), help)];
     };
+    let mut found: Vec<Finding> = Vec::new();
     let framing = entry.config.get("framing").and_then(|f| f.as_str()).unwrap_or("rtu");
     let wanted = if ascii { "ascii" } else { "rtu" };
-    if framing == wanted {
-        return Vec::new();
+    if framing != wanted {
+        let message = format!("serial service '{service}' has framing \"{framing}\"");
+        let help = format!("set framing = \"{wanted}\" there, or change mode here");
+        found.push(Finding::error(me, key, message, help));
     }
-    let message = format!("serial service '{service}' has framing \"{framing}\"");
-    let help = format!("set framing = \"{wanted}\" there, or change mode here");
-    vec![Finding::error(me, key, message, help)]
+    let mut before = stack.services.iter().take_while(|other| other.name != me);
+    if let Some(other) = before.find(|other| masters(other).any(|line| line == service)) {
+        let message = format!("'{}' is a master on the line of '{service}' already", other.name);
+        let help = "a line has one master, else requests and answers collide: put the units of both into one service, or use another line";
+        found.push(Finding::error(me, key, message, help));
+    }
+    found
+}
+
+/// The serial services on whose lines a service is the master.
+fn masters(entry: &ServiceEntry) -> impl Iterator<Item = &str> {
+    let is_master = matches!(entry.kind.as_str(), "modbus-client" | "modbus-gateway");
+    let own = entry.config.get("serial").and_then(|name| name.as_str());
+    let ports = entry.config.get("port").and_then(|ports| ports.as_array()).into_iter().flatten();
+    let more = ports.filter_map(|port| port.get("serial").and_then(|name| name.as_str()));
+    own.into_iter().chain(more).filter(move |_| is_master)
 }
 
 /// Every mistake that can be found without starting.
@@ -140,6 +156,17 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
     if config.reads.is_empty() && config.writes.is_empty() {
         let help = "add [[service.read]] or [[service.write]]; jobs of others are carried out in any case";
         found.push(Finding::warning(name, "", "the service has neither read nor write", help));
+    }
+    for (i, read) in config.reads.iter().enumerate() {
+        if let Some(timeout) = read.timeout.filter(|timeout| *timeout <= read.period) {
+            let message = format!(
+                "timeout = {timeout} is not longer than period = {}: the value turns stale between two reads",
+                read.period
+            );
+            let help =
+                "leave it out (three periods and a response timeout), or give it more than two periods";
+            found.push(Finding::warning(name, &format!("read[{i}].timeout"), message, help));
+        }
     }
     if let Some(service) = &config.serial {
         found.extend(check_serial(name, "serial", service, config.mode == Some(Mode::Ascii), stack));

@@ -1,6 +1,7 @@
 //! What the service declares and checks. The running service is tested in `tests/`.
 
 use super::*;
+use ipc_types::testing::{service, stack};
 use serde_json::{Value, json};
 
 fn config(value: Value) -> Config {
@@ -8,21 +9,7 @@ fn config(value: Value) -> Config {
 }
 
 fn entry(name: &str, kind: &str, config: Value) -> ServiceEntry {
-    ServiceEntry { name: name.into(), kind: kind.into(), index: 1, config, wiring: Wiring::default() }
-}
-
-fn stack(services: Vec<ServiceEntry>) -> Stack {
-    Stack {
-        name: "test".into(),
-        file: "stack.toml".into(),
-        dir: ".".into(),
-        text: String::new(),
-        build_id: String::new(),
-        root: "/nonexistent".into(),
-        prefix: "x".into(),
-        services,
-        topics: vec![],
-    }
+    ServiceEntry { index: 1, ..service(name, kind, config, Wiring::default()) }
 }
 
 fn demo() -> Value {
@@ -82,6 +69,8 @@ fn findings() {
     assert_eq!(said(demo(), vec![serial("rtu"), plc()]), "");
     let mut short = demo();
     short["stale_after"] = json!("10ms");
+    let mut early = demo();
+    early["read"][0]["timeout"] = json!("900ms");
     let all = [
         said(json!({ "tcp": "10.0.0.1:502" }), vec![]),
         said(demo(), vec![plc()]),
@@ -89,6 +78,25 @@ fn findings() {
         said(demo(), vec![serial("ascii"), plc()]),
         said(demo(), vec![serial("rtu")]),
         said(short, vec![serial("rtu"), plc()]),
+        said(early, vec![serial("rtu"), plc()]),
+        said(
+            demo(),
+            vec![
+                serial("rtu"),
+                entry("gw", "modbus-gateway", json!({ "port": [{ "serial": "com1" }] })),
+                plc(),
+            ],
+        ),
+        // Another line, and the line of a server.
+        said(
+            demo(),
+            vec![
+                serial("rtu"),
+                entry("pumps", "modbus-client", json!({ "serial": "com2" })),
+                entry("unit", "modbus-server", json!({ "serial": [{ "port": "com1" }] })),
+                plc(),
+            ],
+        ),
     ];
     insta::assert_snapshot!(all.join("\n"), @r#"
     : the service has neither read nor write -> add [[service.read]] or [[service.write]]; jobs of others are carried out in any case
@@ -97,5 +105,7 @@ fn findings() {
     serial: serial service 'com1' has framing "ascii" -> set framing = "rtu" there, or change mode here
     plc: the stack has no plc service -> add a [[service]] with kind = "plc"; it works without a program too
     stale_after: stale_after = 10ms is shorter than 3 times the longest time between two scans of 'plc' -> leave it out (200ms) or set at least "30ms"
+    read[0].timeout: timeout = 900ms is not longer than period = 1s: the value turns stale between two reads -> leave it out (three periods and a response timeout), or give it more than two periods
+    serial: 'gw' is a master on the line of 'com1' already -> a line has one master, else requests and answers collide: put the units of both into one service, or use another line
     "#);
 }

@@ -30,7 +30,8 @@ pub fn is_request_data(sub_function: u16, data: &[u8]) -> bool {
     match sub_function {
         sub::RETURN_QUERY_DATA => is_words(data),
         sub::RESTART_COMMUNICATIONS => matches!(data, [0 | 0xFF, 0]),
-        sub::CHANGE_ASCII_DELIMITER => matches!(data, [_, 0]),
+        // A colon begins a frame wherever it stands: behind that as delimiter no frame would end any more.
+        sub::CHANGE_ASCII_DELIMITER => matches!(data, &[delimiter, 0] if delimiter != b':'),
         _ => sub::ALL.contains(&sub_function) && data == [0, 0],
     }
 }
@@ -38,4 +39,22 @@ pub fn is_request_data(sub_function: u16, data: &[u8]) -> bool {
 /// Whether a response may carry this data.
 pub(super) fn is_words(data: &[u8]) -> bool {
     (2..=MAX_DATA).contains(&data.len()) && data.len().is_multiple_of(2)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_delimiter_that_would_end_every_frame_for_good_is_refused() {
+        for (data, legal) in [
+            ([b'\n', 0], true),
+            ([b'\r', 0], true),
+            ([0xFF, 0], true),
+            ([b':', 0], false),
+            ([b'!', 1], false),
+        ] {
+            assert_eq!(is_request_data(sub::CHANGE_ASCII_DELIMITER, &data), legal, "{data:02X?}");
+        }
+    }
 }

@@ -1,9 +1,9 @@
 //! What is wrong with a configuration, as far as it can be seen without starting.
 
-use super::addressing_of;
+use super::{KIND, addressing_of};
 use crate::admission::Filter;
 use crate::buffers::Buffers;
-use crate::config::{Config, MAX_CONNECTIONS, MAX_LINES, PlaceError};
+use crate::config::{Config, MAX_CONNECTIONS, MAX_LINES, PlaceError, SerialLine};
 use crate::line::Mode;
 use crate::map_config::MapError;
 use crate::rights::Rights;
@@ -146,6 +146,11 @@ fn check_lines(service: &str, config: &Config, stack: &Stack, findings: &mut Vec
             let help = "give the one line all units: unit = [1, 2]";
             findings.push(Finding::error(service, &key("port"), message, help));
         }
+        for (other, unit) in answered_too(service, line, stack) {
+            let message = format!("unit {unit} on '{}' is answered by '{other}' too", line.port);
+            let help = "two answers at once are none: give each unit of a line to one server";
+            findings.push(Finding::error(service, &key("unit"), message, help));
+        }
         if line.answer_within.ns() == 0 {
             let help = "leave it out (1s)";
             findings.push(Finding::error(service, &key("answer_within"), "no answer could be in time", help));
@@ -166,6 +171,19 @@ fn check_lines(service: &str, config: &Config, stack: &Stack, findings: &mut Vec
             findings.push(Finding::error(service, &key("mode"), message, help));
         }
     }
+}
+
+/// Units of a line that a server before this one in the stack file answers as well, the first of each server.
+fn answered_too(me: &str, line: &SerialLine, stack: &Stack) -> Vec<(String, u8)> {
+    let before = stack.services.iter().take_while(|other| other.name != me);
+    let servers = before.filter(|other| other.kind == KIND).filter_map(|other| {
+        let config: Config = serde_json::from_value(other.config.clone()).ok()?;
+        let lines = config.serial.iter().filter(|theirs| theirs.port == line.port);
+        let mut theirs = lines.flat_map(SerialLine::answers);
+        let both = theirs.find(|unit| line.answers().any(|mine| mine == *unit))?;
+        Some((other.name.clone(), both))
+    });
+    servers.collect()
 }
 
 fn check_places(

@@ -83,7 +83,7 @@ impl Port {
         let mut sent = false;
         let taken = rx.drain(CHUNKS_PER_WAKE, |chunk, bytes| {
             if !enabled {
-                return line.reset();
+                return line.switched_off();
             }
             let mut image = image.borrow_mut();
             image.begin();
@@ -158,6 +158,13 @@ fn hub(
     Ok((hub, address))
 }
 
+/// Time of one character on the line of a serial service.
+fn char_ns(ctx: &Context, port: &str) -> u64 {
+    let config = ctx.stack.service(port).map(|port| port.config.clone());
+    let config = config.and_then(|config| serde_json::from_value::<dinrail_serial::Config>(config).ok());
+    config.map_or(0, |config| config.timing().char_ns)
+}
+
 impl Live {
     fn open(ctx: &mut Context) -> Result<Self, ServiceError> {
         let service = ctx.service.clone();
@@ -196,7 +203,8 @@ impl Live {
                 rx: ctx.subscriber(&TopicKind::SerialRx.of(&serial.port)).map_err(rail)?,
                 tx: ctx.publisher(&TopicKind::SerialTx.of(&serial.port)).map_err(rail)?,
                 answer_within_ns: serial.answer_within.ns(),
-                line: Line::new(serial.mode, index, device, ctx.writer, ctx.generation),
+                line: Line::new(serial.mode, index, device, ctx.writer, ctx.generation)
+                    .with_char_ns(char_ns(ctx, &serial.port)),
             });
         }
         let live = Self {

@@ -302,9 +302,15 @@ impl Engine {
     pub fn skipped_total(&self) -> u64 {
         self.schedule.skipped_total()
     }
-    /// Finds a variable by path or %-address.
+    /// Finds a variable by path or %-address, also a symbol of the stack file that the program lacks.
     pub fn resolve(&self, path: &str) -> Result<Cell, VarError> {
-        value::resolve(self.map(), &self.image, self.setup.addressing, path)
+        let (image, addressing) = (&self.image, self.setup.addressing);
+        let found = value::resolve(self.map(), image, addressing, path);
+        let of_stack = || value::of_stack(&self.setup.externals, image, addressing, path);
+        match found {
+            Err(VarError::Unknown { .. }) => of_stack().map_or(found, Ok),
+            found => found,
+        }
     }
     /// Names what the layout of RETAIN is: only memory of the same layout may be kept.
     pub fn retain_layout(&self) -> u64 {

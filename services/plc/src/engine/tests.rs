@@ -357,3 +357,42 @@ fn variables_are_found_and_wrong_values_refused_with_a_remedy() {
         assert_eq!(cell.text(&memory), text, "{path}");
     }
 }
+
+/// 24.8 and 49.7 days are where 32-bit milliseconds end; PLC time and TIME are 64-bit nanoseconds.
+#[test]
+fn weeks_of_running_wrap_nothing_but_what_is_32_bits_wide() {
+    let mut engine = build(
+        "PROGRAM main VAR t : TON; d : DINT; u : UDINT; l : LINT; m AT %MD0 : TIME; n : UDINT; END_VAR
+         t(IN := TRUE, PT := T#60d); l := TIME_TO_LINT(t.ET); u := TIME_TO_UDINT(t.ET); d := TIME_TO_DINT(t.ET); m := t.ET; n := n + 1; END_PROGRAM",
+    );
+    const DAY: i64 = 86_400_000;
+    scan(&mut engine, 0, COLD);
+    engine.scan = u64::from(u32::MAX);
+    let wrapped = |ms: i64| json!(ms as u32 as i32);
+    for (day, q) in [(24, false), (25, false), (49, false), (50, false), (60, true), (1000, true)] {
+        let before = engine.scan();
+        let outcome = scan(&mut engine, day * DAY, &[]);
+        assert_eq!(outcome.outcome, Outcome::Ok);
+        // The engine was not there for all these periods; they are counted, not made up for.
+        assert!(outcome.skipped > 0);
+        let et = day.min(60) * DAY;
+        for (var, expected) in [
+            ("t.ET", json!(et)),
+            ("t.Q", json!(q)),
+            ("l", json!(et)),
+            ("u", json!(et as u32)),
+            ("d", wrapped(et)),
+            ("m", wrapped(et)),
+        ] {
+            assert_eq!(value(&engine, var), expected, "{var} after {day} days");
+        }
+        assert_eq!(engine.scan(), before + 1);
+        assert_eq!(Content::parse(engine.record()).unwrap().head.scan, before + 1);
+    }
+    assert_eq!(value(&engine, "n"), json!(7));
+    // At the end of 292 years the schedule ends, without a fault.
+    for ms in [i64::MAX / 1_000_000 - 1, i64::MAX / 1_000_000] {
+        assert_eq!(scan(&mut engine, ms, &[]).outcome, Outcome::Ok);
+    }
+    assert!(engine.next_task_ns().is_some());
+}

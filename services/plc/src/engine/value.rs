@@ -1,6 +1,8 @@
 //! Variables by name: where they lie, their values as text and JSON, and patches that set them.
 
+use crate::setup::External;
 use dinrail_iec::artifact::{AreaKind, DebugMap, ElemType, Storage, Symbol};
+use dinrail_iec::types::elementary;
 use dinrail_iec::{AddressSize, Addressing, parse_address};
 use ipc_types::scan_record::Patch;
 use serde_json::Value as Json;
@@ -62,10 +64,26 @@ pub fn resolve(
     if path.starts_with('%') {
         return located(image, addressing, path);
     }
-    let (name, indices) = split_indices(path)?;
+    // Members of structures in arrays have an index within their name.
+    let whole = map.and_then(|map| find(map, path));
+    let (name, indices) = if whole.is_some() { (path, Vec::new()) } else { split_indices(path)? };
     let unknown = || VarError::Unknown { path: path.to_owned(), hint: nearest(map, name) };
     let symbol = map.and_then(|map| find(map, name)).ok_or_else(unknown)?;
     element(symbol, path, &indices)
+}
+
+/// A symbol of the stack file, for an engine whose program does not have it.
+pub fn of_stack(externals: &[External], image: &Image, addressing: Addressing, path: &str) -> Option<Cell> {
+    let path = path.trim();
+    let external = externals.iter().find(|e| e.name.eq_ignore_ascii_case(path))?;
+    let elem = elementary(&external.type_name)?;
+    let place = located(image, addressing, &external.address).ok()?;
+    let storage = match place.storage {
+        Storage::Plain if elem == ElemType::Time && place.bytes() == 4 => Storage::Millis32,
+        storage => storage,
+    };
+    let cell = Cell { elem, storage, ..place };
+    (cell.bytes() == place.bytes()).then_some(cell)
 }
 
 /// The symbol of this path; of several with this ending, the one of a program instance.
@@ -99,7 +117,10 @@ fn located(image: &Image, addressing: Addressing, path: &str) -> Result<Cell, Va
 }
 
 fn split_indices(path: &str) -> Result<(&str, Vec<i64>), VarError> {
-    let Some((name, rest)) = path.split_once('[') else { return Ok((path, Vec::new())) };
+    let Some((name, rest)) = path.rsplit_once('[') else { return Ok((path, Vec::new())) };
+    if rest.contains("].") {
+        return Ok((path, Vec::new()));
+    }
     let bad = || VarError::Address {
         path: path.to_owned(),
         message: "write an index like [3] or [1,2]".to_owned(),
@@ -136,7 +157,9 @@ fn element(symbol: &Symbol, path: &str, indices: &[i64]) -> Result<Cell, VarErro
 }
 
 fn nearest(map: Option<&DebugMap>, name: &str) -> String {
-    let Some(map) = map else { return "; there is no program, only %-addresses".to_owned() };
+    let Some(map) = map else {
+        return "; there is no program, only %-addresses and the symbols of the stack file".to_owned();
+    };
     let wanted = name.to_ascii_lowercase();
     let tail = wanted.rsplit('.').next().unwrap_or(&wanted).to_owned();
     let several: Vec<&str> = map
@@ -226,8 +249,11 @@ impl Cell {
                 }
             }
             ElemType::Real => {
-                let x = number(value).ok_or_else(|| error("a number"))? as f32;
-                u64::from(x.to_bits())
+                let x = number(value).ok_or_else(|| error("a number"))?;
+                if x.is_finite() && (x as f32).is_infinite() {
+                    return Err(error("a number up to 3.4e38"));
+                }
+                u64::from((x as f32).to_bits())
             }
             ElemType::Lreal => number(value).ok_or_else(|| error("a number"))?.to_bits(),
             ElemType::Time => {
@@ -302,12 +328,57 @@ fn time_ns(value: &Json) -> Option<i64> {
             (ms.abs() < 9e12).then_some((ms * 1e6).round() as i64)
         }
         Json::String(s) => {
-            let upper = s.trim().to_ascii_uppercase();
-            let body = upper.strip_prefix("T#").or_else(|| upper.strip_prefix("TIME#")).unwrap_or(&upper);
-            body.to_ascii_lowercase().parse::<ipc_types::units::Span>().ok().map(|span| span.ns() as i64)
+            let lower = s.trim().to_ascii_lowercase();
+            let body = ["t#", "time#", "lt#", "ltime#"].iter().find_map(|p| lower.strip_prefix(p));
+            let body = body.unwrap_or(&lower);
+            let span = || body.parse::<ipc_types::units::Span>().ok().map(|span| span.ns() as i64);
+            literal_ns(body).or_else(span)
         }
         _ => None,
     }
+}
+
+/// `1h30m`, `-2.5s`, `1s500ms`: the parts of a duration literal, in falling units.
+fn literal_ns(text: &str) -> Option<i64> {
+    const UNITS: [(&str, f64); 7] =
+        [("d", 86400e9), ("h", 3600e9), ("m", 60e9), ("s", 1e9), ("ms", 1e6), ("us", 1e3), ("ns", 1.0)];
+    let text = text.replace('_', "");
+    let (sign, mut rest) = text.strip_prefix('-').map_or((1.0, text.as_str()), |rest| (-1.0, rest));
+    let (mut sum, mut next) = (0.0, 0);
+    while !rest.is_empty() {
+        let end = rest.find(|c: char| !(c.is_ascii_digit() || c == '.'))?;
+        let number: f64 = rest[..end].parse().ok()?;
+        rest = &rest[end..];
+        let end = rest.find(|c: char| !c.is_ascii_alphabetic()).unwrap_or(rest.len());
+        let at = UNITS.iter().position(|(unit, _)| *unit == &rest[..end]).filter(|at| *at >= next)?;
+        (sum, next, rest) = (sum + number * UNITS[at].1, at + 1, &rest[end..]);
+    }
+    (next > 0 && sum < 9e18).then_some((sign * sum).round() as i64)
+}
+
+/// Milliseconds as a duration literal: `T#500ms`, `T#2m3.25s`, `T#1d`.
+pub fn time_text(ms: f64) -> String {
+    let sign = if ms < 0.0 { "-" } else { "" };
+    let ns = (ms.abs() * 1e6).round() as u64;
+    let fraction = |ns: u64, unit: u64| {
+        let text = format!("{}.{:09}", ns / unit, ns % unit * (1_000_000_000 / unit));
+        text.trim_end_matches('0').trim_end_matches('.').to_owned()
+    };
+    let mut text = format!("T#{sign}");
+    if ns < 1_000_000_000 {
+        return text + &fraction(ns, 1_000_000) + "ms";
+    }
+    let mut left = ns;
+    for (unit, name) in [(86_400_000_000_000, "d"), (3_600_000_000_000, "h"), (60_000_000_000, "m")] {
+        if left >= unit {
+            text += &format!("{}{name}", left / unit);
+            left %= unit;
+        }
+    }
+    if left > 0 {
+        text += &(fraction(left, 1_000_000_000) + "s");
+    }
+    text
 }
 
 /// Name and cell of what lies at this byte: `prg.a[3]`, else `%IB5`, else `DATA+12`.
@@ -353,4 +424,75 @@ fn index_text(symbol: &Symbol, at: i64) -> String {
     }
     let texts: Vec<String> = indices.iter().map(i64::to_string).collect();
     format!("[{}]", texts.join(","))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn durations_are_written_and_read_as_the_language_has_them() {
+        for (ms, text) in [
+            (0.0, "T#0ms"),
+            (500.0, "T#500ms"),
+            (0.0015, "T#0.0015ms"),
+            (1500.0, "T#1.5s"),
+            (60_000.0, "T#1m"),
+            (123_250.0, "T#2m3.25s"),
+            (90_061_000.0, "T#1d1h1m1s"),
+            (-250.0, "T#-250ms"),
+        ] {
+            assert_eq!(time_text(ms), text);
+            assert_eq!(time_ns(&Json::from(text)), Some((ms * 1e6_f64).round() as i64), "{text}");
+        }
+        for (text, ns) in [
+            ("1.5s", Some(1_500_000_000)),
+            ("TIME#1s_500ms", Some(1_500_000_000)),
+            ("LT#2us", Some(2000)),
+            ("5min", Some(300_000_000_000)),
+            ("T#1ms1s", None),
+            ("T#", None),
+            ("soon", None),
+            ("T#1", None),
+        ] {
+            assert_eq!(time_ns(&Json::from(text)), ns, "{text}");
+        }
+    }
+
+    #[test]
+    fn symbols_of_the_stack_file_are_known_without_a_program() {
+        let setup = crate::setup::Setup::default();
+        let external = |name: &str, address: &str, type_name: &str| External {
+            name: name.to_owned(),
+            address: address.to_owned(),
+            type_name: type_name.to_owned(),
+            origin: String::new(),
+        };
+        let externals = [
+            external("Level", "%ID1", "REAL"),
+            external("Pump", "%QX0.3", "BOOL"),
+            external("Delay", "%MD2", "TIME"),
+            external("Odd", "%QB1", "REAL"),
+        ];
+        let image = setup.plain_image();
+        let found = |name: &str| of_stack(&externals, &image, Addressing::Element, name);
+        let level = found("level").unwrap();
+        assert_eq!((level.offset - image.input.offset, level.elem), (4, ElemType::Real));
+        assert_eq!(found("Pump").unwrap().storage, Storage::Bit(3));
+        assert_eq!(found("Delay").unwrap().storage, Storage::Millis32);
+        assert_eq!((found("Odd"), found("Nothing")), (None, None));
+    }
+
+    proptest! {
+        #[test]
+        fn any_time_is_read_as_it_was_written(ms in -1e9_f64..1e9) {
+            let ns = (ms * 1e6).round();
+            prop_assert_eq!(time_ns(&Json::from(time_text(ns / 1e6))), Some(ns as i64));
+        }
+        #[test]
+        fn no_text_is_too_odd(text in "\\PC{0,30}") {
+            let _ = time_ns(&Json::from(text));
+        }
+    }
 }

@@ -91,3 +91,79 @@ fn engines_whose_files_differ_in_the_last_part_only_do_not_meet() {
     assert_eq!(read_file(&dir.join("keep.1")).map(|kept| kept.bytes), Some(b"one".to_vec()));
     std::fs::remove_dir_all(&dir).unwrap();
 }
+
+#[test]
+fn a_copy_that_fails_is_told_once_and_once_when_it_succeeds_again() {
+    let dir = std::env::temp_dir().join(format!("dinrail-retain-full-{}", std::process::id()));
+    let _ = std::fs::remove_dir_all(&dir);
+    let path = dir.join("a.retain");
+    let fd = rustix::fs::memfd_create("retain-test", rustix::fs::MemfdFlags::CLOEXEC).unwrap();
+    rustix::fs::ftruncate(&fd, MEMORY_BYTES as u64).unwrap();
+    let mut map = Mapping::new(&fd, MEMORY_BYTES).unwrap();
+    let mut committer = Committer::new(map.bytes());
+    committer.commit(map.bytes_mut(), 5, 1, b"one");
+    // The folder is not there.
+    let copy = DiskCopy::start(fd, path.clone()).unwrap();
+    let wait = |what: &str, mut found: Box<dyn FnMut() -> bool + '_>| {
+        let limit = Instant::now() + Duration::from_secs(20);
+        while !found() {
+            assert!(Instant::now() < limit, "{what}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    };
+    let mut news = Vec::new();
+    wait("several failures", Box::new(|| copy.failures() >= 3));
+    news.extend(copy.news());
+    assert_eq!(copy.news(), None, "once");
+    let Some(CopyNews::Failing(text)) = news.pop() else { panic!("not told") };
+    assert!(text.contains(&path.display().to_string()) && text.contains("make its folder"), "{text}");
+    std::fs::create_dir_all(&dir).unwrap();
+    wait(
+        "told that it works",
+        Box::new(|| {
+            news.extend(copy.news());
+            !news.is_empty()
+        }),
+    );
+    assert!(matches!(&news[..], [CopyNews::Working(_)]), "{news:?}");
+    assert_eq!(read_file(&path).map(|kept| kept.bytes), Some(b"one".to_vec()));
+    drop(copy);
+    std::fs::remove_dir_all(&dir).unwrap();
+}
+
+/// Power is cut anywhere in the writing of a second state: the first or the second is read, never none.
+#[test]
+fn a_power_cut_while_the_file_is_written_loses_neither_copy() {
+    let dir = std::env::temp_dir().join(format!("dinrail-retain-cut-{}", std::process::id()));
+    let _ = std::fs::remove_dir_all(&dir);
+    std::fs::create_dir_all(&dir).unwrap();
+    let path = dir.join("a.retain");
+    let aside = dir.join("a.retain.new");
+    let bytes = |seq: u64, data: &[u8]| [&header(seq, 7, seq as i64, data)[..], data].concat();
+    let (old, new) = (bytes(1, &[1; 40]), bytes(2, &[2; 40]));
+    let read = || read_file(&path).map(|kept| kept.bytes[0]);
+    assert_eq!(read(), None);
+    std::fs::write(&path, &old).unwrap();
+    for written in 0..=new.len() {
+        std::fs::write(&aside, &new[..written]).unwrap();
+        assert_eq!(read(), Some(1), "{written} bytes beside");
+    }
+    // A rename in two steps: first the old name goes.
+    std::fs::remove_file(&path).unwrap();
+    assert_eq!(read(), Some(2));
+    std::fs::write(&path, []).unwrap();
+    assert_eq!(read(), Some(2));
+    std::fs::rename(&aside, &path).unwrap();
+    assert_eq!(read(), Some(2));
+    // Any damage is seen.
+    for at in (0..new.len()).filter(|at| !(48..HEADER_BYTES).contains(at)) {
+        let mut damaged = new.clone();
+        damaged[at] ^= 0x10;
+        std::fs::write(&path, &damaged).unwrap();
+        assert_eq!(read(), None, "byte {at}");
+    }
+    // What is no file of ours is not read to its end.
+    assert_eq!(read_file(std::path::Path::new("/dev/zero")), None);
+    assert_eq!(read_file(&dir), None);
+    std::fs::remove_dir_all(&dir).unwrap();
+}

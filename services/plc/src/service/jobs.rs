@@ -108,10 +108,9 @@ pub(super) fn parse(tail: &[u8], engine: &Engine, waiting: &[(Source, Order)]) -
         "unforce" => {
             let path = text("var")?;
             let cell = engine.resolve(path).map_err(|e| fail(e.to_string()))?;
-            let found = engine.forces().find(|(name, patch)| {
-                name.eq_ignore_ascii_case(path)
-                    || (patch.offset == cell.offset && u32::from(patch.len) == cell.bytes())
-            });
+            // Any value will do: what counts is the place, down to its bits.
+            let place = cell.patch(path, &json!(0)).map_err(|e| fail(e.to_string()))?;
+            let found = engine.forces().find(|(_, patch)| patch.same_place(&place));
             let Some((name, patch)) = found else { return Err(fail(format!("'{path}' is not forced"))) };
             one(Order::Unforce(*patch, name.to_owned()))
         }
@@ -288,6 +287,112 @@ mod tests {
         let wrong: Vec<Value> = (0..20).map(|i| json!({ "var": format!("x{i}"), "value": 1 })).collect();
         let said = orders(&engine, &json!({ "do": "write", "set": wrong })).unwrap_err();
         assert!(said.ends_with("no variable 'x7'; and 12 more"), "{said}");
+    }
+
+    #[test]
+    fn unforce_means_the_very_bits() {
+        let mut engine = engine(
+            "PROGRAM main VAR a, b : INT; c : BOOL; r : REAL; l : LREAL; t : TIME; q AT %QX0.3 : BOOL; m AT %MD4 : TIME; END_VAR END_PROGRAM",
+        );
+        let unforce = |engine: &Engine, var: &str| orders(engine, &json!({ "do": "unforce", "var": var }));
+        engine.begin(Stamps::default());
+        for (path, value) in [
+            ("%QX0.3", json!(true)),
+            ("%QB1", json!(7)),
+            ("main.a", json!(1)),
+            ("c", json!(true)),
+            ("r", json!(1.5)),
+            ("l", json!(1)),
+            ("t", json!(5)),
+            ("m", json!(5)),
+        ] {
+            let patch = engine.resolve(path).unwrap().patch(path, &value).unwrap();
+            engine.control(&Source::default(), &Command::Force { patch, path });
+        }
+        engine.finish();
+        // A neighbour in the same byte, the byte around the bit, a bit of the byte.
+        for other in ["%QX0.4", "%QB0", "%QX1.0", "b", "%MW4"] {
+            assert_eq!(unforce(&engine, other).unwrap_err(), format!("'{other}' is not forced"));
+        }
+        for (path, name) in [
+            ("%qx0.3", "%QX0.3"),
+            ("main.q", "%QX0.3"),
+            ("%QB1", "%QB1"),
+            ("a", "main.a"),
+            ("main.c", "c"),
+            ("r", "r"),
+            ("l", "l"),
+            ("t", "t"),
+            ("main.m", "m"),
+        ] {
+            match unforce(&engine, path).as_deref() {
+                Ok([Order::Unforce(_, found)]) => assert_eq!(found, name),
+                other => panic!("{path}: {other:?}"),
+            }
+        }
+    }
+
+    #[test]
+    fn values_at_and_beyond_the_limits_of_every_type() {
+        let mut engine = engine(
+            "TYPE e : (one, two); END_TYPE PROGRAM main VAR b : BOOL; s : SINT; us : USINT; i : INT; u : UINT; d : DINT; ud : UDINT; l : LINT; ul : ULINT; w : WORD; lw : LWORD; r : REAL; lr : LREAL; t : TIME; k : e; m AT %MD4 : TIME; END_VAR END_PROGRAM",
+        );
+        let write = |engine: &mut Engine, var: &str, value: Value| -> Result<Value, String> {
+            let set = orders(engine, &json!({ "do": "write", "var": var, "value": value }))?;
+            engine.begin(Stamps::default());
+            engine.control(&Source::default(), &set[0].command());
+            engine.finish();
+            Ok(one(var, engine).unwrap().0)
+        };
+        for (var, value) in [
+            ("b", json!(true)),
+            ("s", json!(-128)),
+            ("s", json!(127)),
+            ("us", json!(255)),
+            ("i", json!(-32768)),
+            ("u", json!(65535)),
+            ("d", json!(-2_147_483_648_i64)),
+            ("ud", json!(4_294_967_295_u32)),
+            ("l", json!(i64::MIN)),
+            ("l", json!(i64::MAX)),
+            ("ul", json!(u64::MAX)),
+            ("lw", json!(u64::MAX)),
+            ("w", json!(65535)),
+            ("k", json!(1)),
+            ("r", json!(3.402_823_5e38)),
+            ("r", json!(-0.1)),
+            ("lr", json!(1e300)),
+            ("t", json!(-1500)),
+            ("t", json!(0.000_001)),
+            ("m", json!(-2_147_483_648_i64)),
+        ] {
+            assert_eq!(write(&mut engine, var, value.clone()), Ok(value), "{var}");
+        }
+        for (var, value) in
+            [("w", json!("16#FFFF")), ("us", json!("2#1010")), ("b", json!("TRUE")), ("r", json!("NaN"))]
+        {
+            write(&mut engine, var, value.clone()).unwrap_or_else(|e| panic!("{var} {value}: {e}"));
+        }
+        for (var, value) in [
+            ("b", json!(2)),
+            ("s", json!(128)),
+            ("us", json!(-1)),
+            ("i", json!(32768)),
+            ("i", json!(1.5)),
+            ("i", json!("five")),
+            ("u", json!(null)),
+            ("ud", json!(4_294_967_296_u64)),
+            ("l", json!(u64::MAX)),
+            ("w", json!("16#10000")),
+            ("r", json!(1e39)),
+            ("r", json!(-1e39)),
+            ("r", json!([1])),
+            ("t", json!(1e13)),
+            ("m", json!(2_147_483_648_i64)),
+        ] {
+            let said = write(&mut engine, var, value.clone()).unwrap_err();
+            assert!(said.contains("does not fit"), "{var} {value}: {said}");
+        }
     }
 
     #[test]

@@ -13,11 +13,11 @@ use super::watch::Watch;
 use super::{RETAIN_FD, RunError, restart_of};
 use crate::config::{Config, DEFAULT_CYCLE, Trigger, TriggerWord};
 use crate::engine::{Engine, FaultReport, Runtime, Stamps, write_result};
-use crate::retain::{Committer, DiskCopy, MEMORY_BYTES, Mapping, newest, read_file};
+use crate::retain::{Committer, CopyNews, DiskCopy, MEMORY_BYTES, Mapping, newest, read_file};
 use ipc_types::event::{EventBody, EventKind, Level};
 use ipc_types::inbox::Inbox;
 use ipc_types::payload::{
-    Event, HealthState, Image, ImageWrite, Job, JobResult, PlcState, Quality, ScanPart,
+    Event, HealthState, Image, ImageWrite, Job, JobResult, PlcState, Quality, ScanPart, event_flag,
 };
 use ipc_types::port::{Publisher, Subscriber};
 use ipc_types::rail::RailError;
@@ -26,6 +26,7 @@ use ipc_types::scan_record::{Content, Reason, Source, Start, flag, part_header, 
 use ipc_types::topic::{EVENTS, TopicKind};
 use ipc_types::{Context, clock};
 use serde_json::{Value, json};
+use std::os::fd::OwnedFd;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -83,6 +84,8 @@ pub(super) struct Live {
     keyframe_due_ns: u64,
     retain: Option<(Mapping, Committer)>,
     disk: Option<DiskCopy>,
+    /// RETAIN memory and file, for a program with RETAIN that is loaded later.
+    disk_place: Option<(OwnedFd, PathBuf)>,
     retain_layout: u64,
     started_ns: u64,
     waiting: bool,
@@ -140,6 +143,7 @@ impl Live {
             keyframe_due_ns: now_ns + KEYFRAME_NS,
             retain: None,
             disk: None,
+            disk_place: None,
             retain_layout: engine.retain_layout(),
             started_ns: now_ns,
             waiting: true,
@@ -182,19 +186,15 @@ impl Live {
         let mut kept = newest(mapping.bytes());
         let committer = Committer::new(mapping.bytes());
         self.retain = Some((mapping, committer));
-        if !self.engine.retain().is_empty() {
-            let path = self.config.retain_file.as_ref().map_or_else(
-                || ctx.stack.dir.join(format!("{}.{}.retain", ctx.stack.name, ctx.service)),
-                |file| ctx.stack.dir.join(file),
-            );
-            if kept.is_none() {
-                kept = read_file(&path);
-            }
-            match DiskCopy::start(fd, path) {
-                Ok(copy) => self.disk = Some(copy),
-                Err(e) => tracing::error!("RETAIN variables are not copied to disk: {e}"),
-            }
+        let path = self.config.retain_file.as_ref().map_or_else(
+            || ctx.stack.dir.join(format!("{}.{}.retain", ctx.stack.name, ctx.service)),
+            |file| ctx.stack.dir.join(file),
+        );
+        if kept.is_none() && !self.engine.retain().is_empty() {
+            kept = read_file(&path);
         }
+        self.disk_place = Some((fd, path));
+        self.copy_to_disk();
         let Some(kept) = kept else { return Start::Cold };
         if kept.layout != self.retain_layout || !self.engine.set_retain(&kept.bytes) {
             tracing::warn!("the kept RETAIN variables are of another program: cold start");
@@ -202,6 +202,18 @@ impl Live {
         }
         self.base_ns = self.started_ns as i64 - kept.plc_time_ns;
         Start::Warm
+    }
+
+    /// Starts the copies to disk, once the program has RETAIN variables.
+    pub(super) fn copy_to_disk(&mut self) {
+        if self.disk.is_some() || self.engine.retain().is_empty() {
+            return;
+        }
+        let Some((fd, path)) = &self.disk_place else { return };
+        match fd.try_clone().and_then(|fd| DiskCopy::start(fd, path.clone())) {
+            Ok(copy) => self.disk = Some(copy),
+            Err(e) => tracing::error!("RETAIN variables are not copied to disk: {e}"),
+        }
     }
 
     pub(super) fn retain_failures(&self) -> u64 {
@@ -326,8 +338,8 @@ impl Live {
     fn read_events(&mut self) {
         let Self { events, inputs, .. } = self;
         events.drain(256, |header, tail| {
-            // Only the launcher knows who died.
-            if header.stamp.writer != 0 {
+            // Only the launcher knows who died; what it says again was heard before.
+            if header.stamp.writer != 0 || header.flags & event_flag::AGAIN != 0 {
                 return;
             }
             let Ok(body) = serde_json::from_slice::<EventBody>(tail) else { return };
@@ -524,7 +536,21 @@ impl Live {
                 self.utc_offset_ns = offset_ns;
             }
             self.shown_times = std::mem::take(&mut self.times);
+            self.tell_retain(ctx);
             ctx.status(&status(self, now_ns));
+        }
+    }
+
+    /// Whether RETAIN variables reach the disk: once when they no longer do, once when they do again.
+    fn tell_retain(&mut self, ctx: &mut Context) {
+        match self.disk.as_ref().and_then(DiskCopy::news) {
+            Some(CopyNews::Failing(message)) => {
+                ctx.event(EventKind::RetainFault, Level::Fault, message, Value::Null);
+            }
+            Some(CopyNews::Working(message)) => {
+                ctx.event(EventKind::RetainFault, Level::Info, message, Value::Null);
+            }
+            None => {}
         }
     }
 

@@ -100,6 +100,8 @@ fn mistakes_are_found_without_starting() {
             "plc.route[0]: '%IW2' lies in %I",
         ),
         (json!({}), GOOD, vec![], "plc.: neither program nor route"),
+        (json!({ "retain_file": "nowhere/a.retain" }), GOOD, vec![], "plc.retain_file: "),
+        (json!({ "retain_file": "." }), GOOD, vec![], "plc.retain_file: "),
         (program.clone(), GOOD, vec![], "plc.program: the program does not compile:\nerror["),
         (
             program.clone(),
@@ -125,6 +127,12 @@ fn mistakes_are_found_without_starting() {
             vec![],
             "plc.program: the program does not compile:\nerror[",
         ),
+        (
+            program.clone(),
+            "PROGRAM p VAR n : INT; END_VAR n := 1; END_PROGRAM CONFIGURATION c RESOURCE r ON PLC TASK t(INTERVAL := T#99us, PRIORITY := 0); PROGRAM i WITH t : p; END_RESOURCE END_CONFIGURATION",
+            vec![],
+            "plc.program: TASK t has an INTERVAL of 99us",
+        ),
     ];
     for (config, text, ranges, expected) in table {
         let findings = found(config.clone(), text, ranges);
@@ -132,6 +140,23 @@ fn mistakes_are_found_without_starting() {
             findings.iter().any(|f| f.starts_with(expected)),
             "{config}: expected {expected:?} in {findings:#?}"
         );
+    }
+}
+
+#[test]
+fn two_engines_do_not_share_a_retain_file() {
+    let dir = std::env::temp_dir();
+    let mut stack = stack(&dir, Vec::new());
+    let mut other = stack.services[1].clone();
+    (other.name, other.index) = ("plc2".into(), 3);
+    for (theirs, wrong) in [("a.retain", true), ("b.retain", false)] {
+        other.config = json!({ "retain_file": theirs });
+        stack.services.truncate(2);
+        stack.services.push(other.clone());
+        let config: Config = serde_json::from_value(json!({ "retain_file": "a.retain" })).unwrap();
+        let findings = check(&config, &stack, &stack.services[1]);
+        let said = findings.iter().any(|f| f.key == "retain_file" && f.message.contains("'plc2'"));
+        assert_eq!(said, wrong, "{theirs}");
     }
 }
 

@@ -14,7 +14,8 @@ END_PROGRAM";
 #[test]
 fn every_variable_of_every_scan_is_shown() {
     let settings = [Setting { scan: 3, variable: "inc".into(), value: json!(10) }];
-    let trace = trace_scans(source("main.st", COUNTER), Some(5_000_000), 4, &settings).unwrap();
+    let trace =
+        trace_scans(source("main.st", COUNTER), Setup::default(), Some(5_000_000), 4, &settings).unwrap();
     let n: Vec<i64> = trace.iter().map(|t| t.variables["main.n"].as_i64().unwrap()).collect();
     assert_eq!(n, [1, 2, 12, 22]);
     assert_eq!(trace[3].t_ms, 15.0);
@@ -28,7 +29,7 @@ fn a_case_names_scan_variable_expected_and_got() {
         { "scan": 2, "in": { "inc": 5 }, "out": { "n": 6 } },
         { "scan": 5, "out": { "n": 22 } },
     ] });
-    let report = trace_case(source("main.st", COUNTER), &case.to_string()).unwrap();
+    let report = trace_case(source("main.st", COUNTER), Setup::default(), &case.to_string()).unwrap();
     let difference = report.first_difference.unwrap();
     assert_eq!((difference.scan, difference.variable.as_str()), (5, "n"));
     assert_eq!((difference.expected, difference.got), (json!(22), json!(21)));
@@ -38,6 +39,7 @@ fn a_case_names_scan_variable_expected_and_got() {
 #[test]
 fn unknown_variables_are_named_with_their_scan() {
     let case = json!({ "case": "x", "task_interval_ms": 10, "scans": [{ "scan": 1, "in": { "speed": 1 } }] });
-    let error = trace_case(source("main.st", COUNTER), &case.to_string()).unwrap_err().to_string();
+    let error =
+        trace_case(source("main.st", COUNTER), Setup::default(), &case.to_string()).unwrap_err().to_string();
     assert_eq!(error, "scan 1: no variable 'speed'");
 }

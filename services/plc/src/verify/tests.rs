@@ -418,3 +418,135 @@ fn rubbish_is_survived() {
     recording.insert(8, (1, vec![0; 500]));
     assert_eq!(verify(&recording).exit_code(), 3);
 }
+
+fn without(recording: &Recording, missing: impl Fn(Kind, u64) -> bool) -> Recording {
+    let mut some = recording.clone();
+    some.retain(|(_, bytes)| {
+        let head = Content::parse(bytes).unwrap().head;
+        !missing(head.kind, head.scan)
+    });
+    some
+}
+
+fn spans(report: &Report) -> Vec<(u32, u64, u64)> {
+    report.unverifiable.iter().map(|u| (u.generation, u.from, u.to)).collect()
+}
+
+#[test]
+fn scans_that_are_missing_before_the_last_keyframe_are_listed() {
+    let recording = record(&plain(40), 20);
+    // The last keyframe is the file's end, or nearly.
+    let report = verify(&without(&recording, |kind, scan| kind == Kind::Scan && scan > 33));
+    assert_eq!((report.exit_code(), spans(&report)), (3, vec![(1, 34, 40)]), "{report:#?}");
+    assert_eq!((report.scans, report.scans_verified), (40, 33));
+    // None between two keyframes.
+    let report = verify(&without(&recording, |kind, scan| kind == Kind::Scan && scan > 20));
+    assert_eq!((report.exit_code(), spans(&report)), (3, vec![(1, 21, 40)]), "{report:#?}");
+}
+
+#[test]
+fn a_damaged_record_is_told_wherever_it_stands() {
+    let recording = record(&plain(40), 20);
+    for (index, (_, bytes)) in recording.iter().enumerate() {
+        let head = Content::parse(bytes).unwrap().head;
+        let mut damaged = recording.clone();
+        damaged[index].1[1] = 9;
+        let report = verify(&damaged);
+        assert_eq!(report.exit_code(), 3, "{head:?}: {report:#?}");
+        assert!(report.incomplete[0].contains("a record is damaged"), "{report:#?}");
+        if head.kind == Kind::Scan && head.scan < 40 {
+            let first = report.unverifiable.first().unwrap();
+            assert_eq!(first.from, head.scan, "{report:#?}");
+        }
+    }
+    // A keyframe whose memory is another one than its head says is no ground to stand on.
+    let mut damaged = recording;
+    let len = damaged[0].1.len();
+    damaged[0].1[len / 2] ^= 1;
+    let report = verify(&damaged);
+    assert!(report.exit_code() == 3 || report.exit_code() == 1, "{report:#?}");
+}
+
+#[test]
+fn an_engine_that_started_anew_without_its_first_keyframe_is_listed_from_its_first_scan() {
+    let mut recording = record(&plain(30), 10);
+    let second: Recording = record(&plain(30), 10).into_iter().map(|(_, bytes)| (2, bytes)).collect();
+    let both: Recording = recording.iter().cloned().chain(second.clone()).collect();
+    assert_eq!(verify(&both).exit_code(), 0);
+    // Keyframe 0 and scans 1 to 4 of the second are lost, then also those up to its next keyframe.
+    for last in [4, 10] {
+        let lost: Recording = second
+            .iter()
+            .filter(|(_, bytes)| {
+                let head = Content::parse(bytes).unwrap().head;
+                !(head.scan <= last && (head.kind == Kind::Scan || head.scan == 0))
+            })
+            .cloned()
+            .collect();
+        let all: Recording = recording.iter().cloned().chain(lost).collect();
+        let report = verify(&all);
+        assert_eq!((report.exit_code(), spans(&report)), (3, vec![(2, 1, 10)]), "{report:#?}");
+        assert_eq!(report.scans_verified, 50);
+    }
+    // A keyframe of the first engine waits for records that never come when the second one starts.
+    recording = without(&recording, |kind, scan| kind == Kind::Scan && scan > 25);
+    let all: Recording = recording.iter().cloned().chain(second).collect();
+    let report = verify(&all);
+    assert_eq!((report.exit_code(), spans(&report)), (3, vec![(1, 26, 30)]), "{report:#?}");
+}
+
+#[test]
+fn what_came_without_a_number_is_told() {
+    let run = |gaps: &[u64], doubts: &[&str]| {
+        let known = program(PROGRAM, &setup());
+        let mut verifier = Verifier::new(Box::new(move |_, _| Some(known.clone()))).unwrap();
+        for (generation, bytes) in record(&plain(10), 100) {
+            verifier.push(generation, &bytes).unwrap();
+        }
+        for n in gaps {
+            verifier.gap(*n);
+        }
+        for why in doubts {
+            verifier.doubt((*why).to_owned());
+        }
+        verifier.finish().unwrap()
+    };
+    assert_eq!(run(&[], &[]).exit_code(), 0);
+    let report = run(&[3, 0], &[]);
+    assert_eq!((report.exit_code(), report.incomplete.len()), (3, 1), "{report:#?}");
+    assert_eq!(run(&[], &["cut off"]).exit_code(), 3);
+    assert_eq!(run(&[], &["many"; 500]).incomplete.len(), MAX_DOUBTS);
+    assert_eq!(verify(&[]).exit_code(), 3, "nothing verified is not exact");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+    /// Whatever is left out, doubled or late: each scan is verified or listed, and only what lies before the first or behind
+    /// the last content of all can be missing unnoticed.
+    #[test]
+    fn every_scan_is_accounted_for(
+        left_out in prop::collection::btree_set(0usize..67, 0..12),
+        moved in prop::collection::vec((0usize..67, 0usize..67), 0..3),
+    ) {
+        let whole = record(&plain(60), 10);
+        let mut some: Recording =
+            whole.iter().enumerate().filter(|(i, _)| !left_out.contains(i)).map(|(_, c)| c.clone()).collect();
+        for (from, to) in moved {
+            let content = some[from % some.len()].clone();
+            let to = to % some.len();
+            some.insert(to, content);
+        }
+        let report = verify(&some);
+        prop_assert!(report.exact, "{:#?}", report);
+        let listed: u64 = report.unverifiable.iter().map(|u| u.to + 1 - u.from).sum();
+        prop_assert_eq!(report.scans, report.scans_verified + listed, "{:#?}", &report);
+        let heads: Vec<Head> = some.iter().map(|(_, b)| Content::parse(b).unwrap().head).collect();
+        let there: std::collections::BTreeSet<u64> =
+            heads.iter().filter(|h| h.kind == Kind::Scan).map(|h| h.scan).collect();
+        prop_assert!(report.scans_verified <= there.len() as u64, "{:#?}", &report);
+        if report.exit_code() == 0 {
+            prop_assert_eq!(report.scans_verified, there.len() as u64, "{:#?}", &report);
+            prop_assert_eq!(heads.iter().map(|h| h.scan).max(), there.last().copied());
+        }
+    }
+}

@@ -6,6 +6,7 @@
 use ipc_types::payload::{CHUNK_BYTES, serial_flag};
 use serde::Serialize;
 
+use super::answer::Expected;
 use super::length::{self, MAX_RTU};
 use super::rtu::{self, MAX_MARKS};
 use super::timing::Timing;
@@ -25,7 +26,7 @@ pub enum Mode {
         /// How long after the last byte more is waited for when what is there is only the beginning of a frame, ns.
         grace_ns: u64,
     },
-    /// ':' to CR LF.
+    /// ':' to the byte behind CR: LF, or the delimiter that a master has set at run time (function 8, sub-function 03).
     Ascii,
     /// Up to these bytes.
     Delimiter {
@@ -131,6 +132,8 @@ pub struct Framer {
     mark_count: usize,
     /// The silence is over, and more is waited for.
     in_grace: bool,
+    /// The answer that ends without a silence.
+    expected: Option<Expected>,
     counters: FrameCounters,
 }
 
@@ -151,6 +154,7 @@ impl Framer {
             marks: [0; MAX_MARKS],
             mark_count: 0,
             in_grace: false,
+            expected: None,
             counters: FrameCounters::default(),
         }
     }
@@ -195,6 +199,12 @@ impl Framer {
     /// the next one.
     pub fn mark(&mut self, flags: u32) {
         self.flags |= flags;
+    }
+
+    /// From now on this answer needs no silence to end, until a good frame was received; `None`: no answer is awaited.
+    /// Ignored while a frame is being received: what began before the request had left is no answer to it.
+    pub fn expect(&mut self, answer: Option<Expected>) {
+        self.expected = answer.filter(|_| !self.is_receiving());
     }
 
     /// These bytes were read at `now_ns`.
@@ -280,14 +290,16 @@ impl Framer {
         }
         let before = if self.len > 0 { self.buffer[self.len - 1] } else { 0 };
         self.put(byte, now_ns, out);
-        if byte == b'\n' && !self.skipping {
-            if self.buffer[0] == b':' && before == b'\r' {
-                self.end(now_ns, out);
-            } else {
-                self.counters.fragments += 1;
-                self.emit(now_ns, serial_flag::END, out);
-                self.clear();
-            }
+        if self.skipping {
+            return;
+        }
+        // Inside of a frame are hexadecimal digits alone, so CR and any byte behind it end it.
+        if self.buffer[0] == b':' && before == b'\r' {
+            self.end(now_ns, out);
+        } else if byte == b'\n' {
+            self.counters.fragments += 1;
+            self.emit(now_ns, serial_flag::END, out);
+            self.clear();
         }
     }
 
@@ -297,7 +309,12 @@ impl Framer {
             return;
         }
         self.store(byte);
-        if self.len == CHUNK_BYTES {
+        // A gap or damage inside leaves it to the silence.
+        let undoubted = self.flags == 0 && self.mark_count == 0;
+        if undoubted && self.expected.is_some_and(|e| e.fits(&self.buffer[..self.len])) {
+            self.rtu_emit(self.len, now_ns, out);
+            self.clear();
+        } else if self.len == CHUNK_BYTES {
             self.overfull(now_ns, out);
         }
     }
@@ -392,13 +409,14 @@ impl Framer {
 
     /// Hands over the first `to` bytes in their pieces.
     fn rtu_emit(&mut self, to: usize, now_ns: u64, out: &mut Out<'_>) {
-        let Self { settings, buffer, counters, marks, mark_count, flags, first_ns, .. } = self;
+        let Self { settings, buffer, counters, marks, mark_count, flags, first_ns, expected, .. } = self;
         let char_ns = if settings.timed { settings.timing.char_ns } else { 0 };
         rtu::cut(&buffer[..to], &marks[..*mark_count], |piece| {
             let mut bytes = &buffer[piece.from..piece.to];
             let mut chunk_flags = *flags | serial_flag::END;
             if piece.good {
                 counters.frames += 1;
+                *expected = None;
             } else if bytes.len() > settings.max_frame {
                 counters.too_long += 1;
                 counters.bytes_cut += (bytes.len() - settings.max_frame) as u64;

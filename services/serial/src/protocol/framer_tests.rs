@@ -1,5 +1,6 @@
 //! Frames under any chunking of reads, with noise, gaps and broken senders.
 
+use super::answer::Expected;
 use super::framer::*;
 use super::timing::Timing;
 use super::{crc, length};
@@ -247,6 +248,18 @@ fn ascii_frames() {
     line.push(5000 * MS, &[&b":"[..], &[b'0'; 600], b"\r\n:01\r\n"].concat());
     assert_eq!((line.seen[7].bytes.len(), line.seen[7].flags), (513, END | OVERRUN));
     assert_eq!(line.seen[8], seen(END, b":01\r\n"));
+    // With another delimiter than LF; one that is lost, and CR where none belongs.
+    line.push(6000 * MS, b":0103FC\r!:0203\r:0304F9\r\n:04\r05\r\n");
+    assert_eq!(
+        line.seen[9..],
+        [
+            seen(END, b":0103FC\r!"),
+            seen(END, b":0203\r"),
+            seen(END, b":0304F9\r\n"),
+            seen(END, b":04\r0"),
+            seen(END, b"5\r\n"),
+        ]
+    );
 }
 
 #[test]
@@ -393,4 +406,57 @@ proptest! {
         line.turn(t + 100 * MS);
         prop_assert_eq!(line.good().pop(), Some(frame));
     }
+}
+
+#[test]
+fn an_awaited_answer_ends_without_silence() {
+    let request = frame(&[1, 3, 0, 0, 0, 2]);
+    let answer = frame(&[1, 3, 4, 0, 1, 0, 2]);
+    let other = frame(&[2, 3, 4, 0, 1, 0, 2]);
+    let expected = Expected::of(&request);
+    let mut line = Line::rtu(20 * MS);
+    line.framer.expect(expected);
+    line.push(100 * MS, &answer[..6]);
+    assert!(line.seen.is_empty());
+    line.push(104 * MS, &answer[6..]);
+    assert_eq!(line.seen, [seen(END, &answer)]);
+    assert_eq!((line.framer.is_receiving(), line.framer.deadline()), (false, None));
+    // The next transmission still waits for the silence behind it.
+    assert_eq!(line.framer.last_ns(), Some(104 * MS));
+    // It was awaited once.
+    line.push(200 * MS, &answer);
+    assert_eq!(line.seen.len(), 1);
+    line.turn(205 * MS);
+    assert_eq!(line.seen.len(), 2);
+    // What began before the request had left, another unit's, a gap inside, damage: by silence.
+    for case in 0..4 {
+        let mut line = Line::rtu(20 * MS);
+        let sent = if case == 1 { &other } else { &answer };
+        match case {
+            0 => line.push(98 * MS, &sent[..1]),
+            3 => line.framer.mark(PARITY),
+            _ => {}
+        }
+        line.framer.expect(expected);
+        let from = usize::from(case == 0);
+        if case == 2 {
+            line.push(100 * MS, &sent[..5]);
+            line.push(107 * MS, &sent[5..]);
+        } else {
+            line.push(100 * MS, &sent[from..]);
+        }
+        assert!(line.seen.is_empty(), "{case}");
+        line.turn(130 * MS);
+        assert_eq!(line.seen.iter().map(|s| &s.bytes).collect::<Vec<_>>(), [sent], "{case}");
+    }
+    // What follows is no part of it, and noise before it leaves it awaited.
+    let mut line = Line::rtu(0);
+    line.framer.expect(expected);
+    line.push(100 * MS, &[0]);
+    line.turn(110 * MS);
+    line.push(150 * MS, &[&answer[..], &[0xFF]].concat());
+    assert_eq!(line.seen, [seen(END, &[0]), seen(END, &answer)]);
+    line.turn(160 * MS);
+    assert_eq!(line.seen[2..], [seen(END, &[0xFF])]);
+    assert_eq!(line.framer.counters().fragments, 2);
 }

@@ -4,6 +4,7 @@
 //! our own bytes that come back on RS-485, [`parmrk`] takes the kernel's marks of damaged bytes out of the stream,
 //! [`pacer`] gives bytes of a pseudo-terminal the time they would take on a line. All memory is reserved beforehand.
 
+pub mod answer;
 pub mod crc;
 pub mod echo;
 pub mod framer;

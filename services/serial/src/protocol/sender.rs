@@ -147,6 +147,11 @@ impl Sender {
         }
     }
 
+    /// Whether a transmission waits until the line was silent.
+    pub fn keeps_silence(&self) -> bool {
+        self.settings.half_duplex
+    }
+
     /// What was counted so far.
     pub fn counters(&self) -> SendCounters {
         self.counters

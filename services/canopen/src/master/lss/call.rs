@@ -138,9 +138,11 @@ impl LssCall {
         }
     }
 
+    /// Who waits longer for an answer has slower devices: then the others' answers are given more time, too.
     pub(super) fn times(&self) -> LssTimes {
         let times = LssTimes::default();
-        LssTimes { timeout_ms: self.timeout_ms().unwrap_or(times.timeout_ms), ..times }
+        let timeout_ms = self.timeout_ms().unwrap_or(times.timeout_ms);
+        LssTimes { timeout_ms, settle_ms: times.settle_ms.max(timeout_ms / 20), ..times }
     }
 
     /// Whether it is for the only device, which nobody named: that no other answers has to be made sure first.

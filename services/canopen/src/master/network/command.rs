@@ -1,6 +1,7 @@
 //! NMT commands: queued, sent in order with the inhibit time between them.
 
 use super::Network;
+use crate::master::boot::{BOOT_UP_NS, ErrorControl, OPERATIONAL};
 use crate::protocol::io::Outbox;
 use crate::protocol::nmt::{NmtCommand, NmtState};
 
@@ -40,32 +41,60 @@ impl Network {
                 Some(state) => self.nodes[i].wanted = state,
                 None => {
                     let node = &mut self.nodes[i];
-                    node.watch = None;
+                    // It is silent while it begins again; one that stays silent is lost.
+                    if let Some(watch) = &mut node.watch {
+                        watch.renew(now_ns, BOOT_UP_NS);
+                    }
                     node.state = None;
                 }
             }
+            // The last word on it, also when the safe state ends.
+            self.nodes[i].held = false;
             self.gate(now_ns, i);
         }
         self.command(command, node);
         self.settle(now_ns, out);
     }
 
-    /// The safe state of the outputs by NMT; `None` leaves it.
+    /// The safe state of the outputs by NMT; `None` leaves it: nodes that it held are started again, others stay as they
+    /// are.
     pub fn set_safe(&mut self, now_ns: u64, safe: Option<NmtCommand>, out: &mut Outbox) {
         if self.safe == safe {
             return;
         }
         self.safe = safe;
-        let command = safe.unwrap_or(NmtCommand::Start);
         for i in 0..self.nodes.len() {
-            if self.nodes[i].boot.is_running() {
-                self.nodes[i].wanted = state_after(command).unwrap_or(127);
-                let id = self.nodes[i].id();
-                self.command(command, id);
-                self.gate(now_ns, i);
+            let node = &mut self.nodes[i];
+            if !node.boot.is_running() {
+                node.held = false;
+                continue;
+            }
+            match safe {
+                Some(command) if node.held || node.wanted == OPERATIONAL => self.hold(now_ns, i, command),
+                None if std::mem::take(&mut node.held) => {
+                    node.wanted = OPERATIONAL;
+                    if node.settings.plan.error_control == ErrorControl::None {
+                        // Nobody will tell another state.
+                        node.state = None;
+                    }
+                    let id = node.id();
+                    self.command(NmtCommand::Start, id);
+                    self.gate(now_ns, i);
+                }
+                _ => {}
             }
         }
         self.settle(now_ns, out);
+    }
+
+    /// Sends a node that runs, or is to run, into the safe state.
+    pub(super) fn hold(&mut self, now_ns: u64, i: usize, command: NmtCommand) {
+        let node = &mut self.nodes[i];
+        node.held = true;
+        node.wanted = state_after(command).unwrap_or(127);
+        let id = node.id();
+        self.command(command, id);
+        self.gate(now_ns, i);
     }
 
     pub(super) fn send_commands(&mut self, now_ns: u64, out: &mut Outbox) {

@@ -111,6 +111,8 @@ pub struct NodeRun {
     pub state: Option<u8>,
     /// NMT state it was commanded to.
     pub wanted: u8,
+    /// The safe state took it out of operation.
+    pub(super) held: bool,
     pub last_failure: Option<Failure>,
     pub emcys: u64,
     pub last_emcy: Option<(u16, u8)>,
@@ -139,6 +141,7 @@ impl NodeRun {
             boot,
             state: None,
             wanted: 127,
+            held: false,
             last_failure: None,
             emcys: 0,
             last_emcy: None,

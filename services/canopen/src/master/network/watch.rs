@@ -28,6 +28,16 @@ pub(super) struct Watch {
     pub(super) guard: Option<Guard>,
 }
 
+impl Watch {
+    /// The node begins again: it is lost when nothing comes for its time, and for `least_ns` at least.
+    pub(super) fn renew(&mut self, now_ns: u64, least_ns: u64) {
+        self.lost_at_ns = now_ns.saturating_add(self.span_ns.max(least_ns));
+        if let Some(guard) = &mut self.guard {
+            guard.toggle = None;
+        }
+    }
+}
+
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Guard {
     every_ns: u64,

@@ -1,6 +1,6 @@
 //! Mistakes in what the table says of the master itself.
 
-use super::times;
+use super::{cob_ids, times};
 use crate::config::{MAX_NODES, MasterConfig as Config};
 use crate::mistakes::Mistakes;
 
@@ -22,6 +22,7 @@ pub(super) fn check_master(config: &Config, mistakes: &mut Mistakes) {
         );
     }
     times::check_master(config, mistakes);
+    cob_ids::check_sync(config, mistakes);
     if config.sync_overflow == 1 || config.sync_overflow > 240 {
         let message = format!("a SYNC counter cannot overflow at {}", config.sync_overflow);
         mistakes.add(

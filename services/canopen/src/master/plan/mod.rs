@@ -3,6 +3,7 @@
 //! Sans-I/O: the EDS files are handed in as [`Device`]s.
 
 mod check;
+mod cob_ids;
 mod image;
 mod pdo;
 mod times;
@@ -18,7 +19,6 @@ use super::network::{NodeSettings, Settings};
 use crate::config::{Check, MAX_MAPS, MAX_NODES, MasterConfig as Config, Node, Restore};
 use crate::device::Device;
 use crate::mistakes::{Mistake, Mistakes};
-use crate::protocol::cob_id::CobId;
 use crate::protocol::data_type::unsigned;
 use check::check_master;
 use dinrail_iec::Addressing;
@@ -39,7 +39,7 @@ pub struct NodePlan {
     pub pdos: Vec<Pdo>,
 }
 
-/// COB-IDs of the network's PDOs: whose it is, and the key that says so.
+/// COB-IDs of the network's SYNC and PDOs: whose it is, and the key that says so.
 type Taken = BTreeMap<u32, (String, Option<String>)>;
 
 /// Everything the service does.
@@ -63,7 +63,7 @@ pub fn plan(config: &Config, devices: &BTreeMap<u8, Device>, addressing: Address
     let mut plan = Plan { settings: settings(config), ..Plan::default() };
     let period_ns = config.sync_period.map_or(0, |p| p.ns());
     plan.sync_window_ns = config.sync_window.map_or(period_ns, |w| w.ns());
-    let mut taken = Taken::new();
+    let mut taken = cob_ids::taken(config);
     for (i, node) in config.nodes.iter().take(MAX_NODES).enumerate() {
         let key = format!("node[{i}]");
         if !(1..=127).contains(&node.id) {
@@ -228,33 +228,6 @@ impl One<'_> {
             revision: get(Check::Revision, &node.revision, "revision", (0x1018, 3)),
             serial: get(Check::Serial, &node.serial_number, "serial_number", (0x1018, 4)),
         }
-    }
-
-    /// Two PDOs of the network with one COB-ID.
-    fn doubled(&mut self, pdos: &[Pdo], taken: &mut Taken) {
-        for pdo in pdos.iter().filter(|p| p.is_active() && (p.used || p.direction == Direction::Tpdo)) {
-            let id = CobId(pdo.cob_id).can_id();
-            let what = format!("{} {} of node {}", pdo.direction.name(), pdo.number, self.node.id);
-            let key = self.cob_id_key(pdo);
-            if let Some((other, key_of_other)) = taken.get(&id) {
-                let message =
-                    format!("{what} and {other} have the same COB-ID {:03X}h", CobId(pdo.cob_id).id());
-                let key = key.as_ref().or(key_of_other.as_ref()).map_or(self.key, String::as_str);
-                self.mistakes.add(key, message, "give one of them another with cob_id");
-            } else {
-                taken.insert(id, (what, key));
-            }
-        }
-    }
-
-    /// Where the stack file writes the COB-ID of a PDO.
-    fn cob_id_key(&self, pdo: &Pdo) -> Option<String> {
-        let (table, written) = match pdo.direction {
-            Direction::Tpdo => ("tpdo", &self.node.tpdo),
-            Direction::Rpdo => ("rpdo", &self.node.rpdo),
-        };
-        let at = written.iter().position(|w| w.number == pdo.number && w.cob_id.is_some())?;
-        Some(format!("{}.{table}[{at}].cob_id", self.key))
     }
 }
 

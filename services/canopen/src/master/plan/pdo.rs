@@ -5,10 +5,11 @@
 
 use super::super::boot::Write;
 use super::super::exchange::transmission;
+use super::cob_ids::is_for_pdo;
 use crate::config::{Node, Pdo as Wanted};
 use crate::device::Device;
 use crate::mistakes::Mistakes;
-use crate::protocol::cob_id::{BIT_31, CobId, is_restricted};
+use crate::protocol::cob_id::{BIT_31, CobId};
 use crate::protocol::data_type::unsigned;
 use std::collections::BTreeSet;
 
@@ -214,7 +215,7 @@ impl<'a> PdoPlanner<'a> {
         pdo.used = true;
         match cob_id {
             None => {}
-            Some((_, Some(id))) if (0..=0x7FF).contains(&id) && !is_restricted(id as u32) => {
+            Some((_, Some(id))) if (0..=0x7FF).contains(&id) && is_for_pdo(CobId(id as u32)) => {
                 pdo.cob_id = id as u32;
             }
             Some((written, id)) => {
@@ -301,9 +302,8 @@ impl<'a> PdoPlanner<'a> {
     /// Gives it a COB-ID that exists.
     fn activate(&mut self, at: usize, key: &str, mistakes: &mut Mistakes) {
         let pdo = &mut self.pdos[at];
-        let id = CobId(pdo.cob_id).id();
         // A device without a COB-ID for it gives 0 or a bare flag.
-        if id != 0 && !is_restricted(id) {
+        if is_for_pdo(CobId(pdo.cob_id)) {
             pdo.cob_id &= !BIT_31;
         } else if pdo.number <= 4 {
             pdo.cob_id =

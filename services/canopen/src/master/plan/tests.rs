@@ -134,3 +134,71 @@ fn mistakes_are_named() {
     .collect();
     insta::assert_snapshot!(said);
 }
+
+#[test]
+fn cob_ids_that_nothing_may_have() {
+    let sync =
+        |id: u32| json!({ "sync_period": "10ms", "sync_cob_id": id, "node": [{ "id": 5, "eds": "x" }] });
+    let pdo = |id: u32| json!({ "node": [{ "id": 5, "eds": "x", "tpdo": [{ "number": 1, "cob_id": id }] }] });
+    let sdo = |object: &str, value: u32| json!({ "node": [{ "id": 5, "eds": "x", "sdo": [{ "object": object, "value": value }] }] });
+    let said: String = [
+        sync(0),
+        sync(0x7F),
+        sync(0x100),
+        sync(0x180),
+        sync(0x85),
+        sync(0x81),
+        sync(0x580),
+        sync(0x700),
+        sync(0x7E5),
+        sync(0x900),
+        // TPDO 1 of node 5 has it.
+        sync(0x185),
+        // Those of TIME, an emergency, an SDO.
+        pdo(0x100),
+        pdo(0x85),
+        pdo(0x580),
+        sdo("1005", 0x7F),
+        sdo("1400:01", 0x585),
+        // Also while it is switched off.
+        sdo("1400:01", 0x8000_0585),
+    ]
+    .into_iter()
+    .map(mistakes)
+    .collect();
+    insta::assert_snapshot!(said, @r"
+    sync_cob_id: 0h cannot be the COB-ID of the SYNC: restricted CAN-ID; leave it out for 080h, or take 181h to 57Fh (CiA 301 clause 7.3.5)
+    sync_cob_id: 7Fh cannot be the COB-ID of the SYNC: restricted CAN-ID; leave it out for 080h, or take 181h to 57Fh (CiA 301 clause 7.3.5)
+    sync_cob_id: 100h cannot be the COB-ID of the SYNC: it is that of TIME; leave it out for 080h, or take 181h to 57Fh (CiA 301 clause 7.3.5)
+    sync_cob_id: 180h cannot be the COB-ID of the SYNC: restricted CAN-ID; leave it out for 080h, or take 181h to 57Fh (CiA 301 clause 7.3.5)
+    sync_cob_id: 85h cannot be the COB-ID of the SYNC: emergencies of node 5 have it; leave it out for 080h, or take 181h to 57Fh (CiA 301 clause 7.3.5)
+    sync_cob_id: 81h cannot be the COB-ID of the SYNC: emergencies of node 1 have it; leave it out for 080h, or take 181h to 57Fh (CiA 301 clause 7.3.5)
+    sync_cob_id: 580h cannot be the COB-ID of the SYNC: it lies among those of SDO and heartbeat; leave it out for 080h, or take 181h to 57Fh (CiA 301 clause 7.3.5)
+    sync_cob_id: 700h cannot be the COB-ID of the SYNC: it lies among those of SDO and heartbeat; leave it out for 080h, or take 181h to 57Fh (CiA 301 clause 7.3.5)
+    sync_cob_id: 7E5h cannot be the COB-ID of the SYNC: restricted CAN-ID; leave it out for 080h, or take 181h to 57Fh (CiA 301 clause 7.3.5)
+    sync_cob_id: 900h cannot be the COB-ID of the SYNC: identifier above 7FFh without the bit for 29-bit identifiers; leave it out for 080h, or take 181h to 57Fh (CiA 301 clause 7.3.5)
+    sync_cob_id: TPDO 1 of node 5 and the SYNC have the same COB-ID 185h; give one of them another with cob_id
+    node[0].tpdo[0].cob_id: 100h is no COB-ID that a PDO may have; take 181h to 57Fh, or 680h to 6DFh (CiA 301 clause 7.3.5)
+    node[0].tpdo[0].cob_id: 85h is no COB-ID that a PDO may have; take 181h to 57Fh, or 680h to 6DFh (CiA 301 clause 7.3.5)
+    node[0].tpdo[0].cob_id: 580h is no COB-ID that a PDO may have; take 181h to 57Fh, or 680h to 6DFh (CiA 301 clause 7.3.5)
+    node[0].sdo[0].value: 1005:00 cannot be 7Fh: restricted CAN-ID; a device refuses it by abort 06090030h; take 181h to 57Fh, or 680h to 6DFh (CiA 301 clause 7.3.5)
+    node[0].sdo[0].value: 1400:01 cannot be 585h: restricted CAN-ID; a device refuses it by abort 06090030h; take 181h to 57Fh, or 680h to 6DFh (CiA 301 clause 7.3.5)
+    ");
+    for fine in [sync(0x80), sync(0x86), sync(0x6DF), pdo(0x181), pdo(0x6DF), sdo("1400:01", 0x2000_0005)] {
+        assert_eq!(mistakes(fine.clone()), "", "{fine}");
+    }
+}
+
+#[test]
+fn nodes_are_told_of_another_sync() {
+    let writes = |config: serde_json::Value| {
+        let plan = planned(config);
+        let writes = &plan.nodes[0].settings.plan.writes;
+        writes.iter().find(|w| w.index == 0x1005).map(|w| w.data.clone())
+    };
+    let with = |id: u32, sdo: serde_json::Value| json!({ "sync_period": "10ms", "sync_cob_id": id, "node": [{ "id": 5, "eds": "x", "sdo": sdo }] });
+    assert_eq!(writes(with(0x80, json!([]))), None);
+    assert_eq!(writes(with(0x300, json!([]))), Some(vec![0, 3, 0, 0]));
+    let by_hand = json!([{ "object": "1005", "value": 0x301 }]);
+    assert_eq!(writes(with(0x300, by_hand)), Some(vec![1, 3, 0, 0]), "once, and as the stack file says");
+}

@@ -31,7 +31,8 @@ impl One<'_> {
         writes
     }
 
-    /// What a consumer of the SYNC must know: whether it has a counter (1019h), and how long its window is (1007h).
+    /// What a consumer of the SYNC must know: its COB-ID where it is not the device's own (1005h), whether it has a
+    /// counter (1019h), and how long its window is (1007h).
     pub(super) fn sync_writes(&mut self, device: &Device, writes: &mut Vec<Write>) {
         let config = self.config;
         if config.sync_period.is_none() {
@@ -44,6 +45,19 @@ impl One<'_> {
         let by_hand = |index| {
             self.node.sdo.iter().any(|w| matches!(w.object.number(), Some((written, _)) if written == index))
         };
+        let listens_to = device.od.u32(0x1005, 0).and_then(|default| self.sync_cob_id_default(default));
+        if let Some(id) = listens_to.filter(|_| !by_hand(0x1005)) {
+            if writable(0x1005) {
+                writes.push(Write { index: 0x1005, sub: 0, data: id.to_le_bytes().to_vec() });
+            } else {
+                let message = format!(
+                    "node {} does not hear a SYNC of {id:X}h: its EDS lacks a writable 1005h",
+                    self.node.id
+                );
+                let help = "leave sync_cob_id out: devices listen to 080h";
+                self.mistakes.warn(&format!("{}.eds", self.key), message, help);
+            }
+        }
         if let Some(window) = config.sync_window
             && writable(0x1007)
             && !by_hand(0x1007)
@@ -79,7 +93,10 @@ impl One<'_> {
             return None;
         }
         match encode(value, entry, self.node.id) {
-            Ok(data) => Some(Write { index, sub, data }),
+            Ok(data) => {
+                self.check_cob_id(index, sub, &data, key);
+                Some(Write { index, sub, data })
+            }
             Err(message) => {
                 self.mistakes.add(&format!("{key}.value"), message, "write a value of the object's type");
                 None

@@ -14,7 +14,7 @@ pub struct LssTimes {
     pub timeout_ms: u16,
     /// Least time between two frames of the master: slaves may be slow to take them.
     pub inhibit_ms: u16,
-    /// Fastscan: after the first answer, how long other slaves may answer too, before the next question.
+    /// Fastscan: after an answer, how long other slaves may answer too, before the next question.
     pub settle_ms: u16,
 }
 
@@ -122,8 +122,8 @@ enum Wait {
     Sending,
     /// Until the answer or the time.
     Answer,
-    /// Fastscan: somebody answered, others may.
-    Settle,
+    /// Fastscan: somebody answered, others may, until then at the latest.
+    Settle { until_ns: u64 },
 }
 
 #[derive(Debug, Clone)]
@@ -205,7 +205,7 @@ impl LssMaster {
                 None
             }
             Wait::Answer if job.scan.is_some() => self.scan_step(t_ns, false),
-            Wait::Settle => self.scan_step(t_ns, true),
+            Wait::Settle { .. } => self.scan_step(t_ns, true),
             Wait::Answer => self.finish(LssResult::Nobody),
         }
     }
@@ -217,7 +217,7 @@ impl LssMaster {
     pub fn on_frame(&mut self, t_ns: u64, frame: &CanFrame) -> Option<LssResult> {
         let data = parse(frame, predefined::LSS_SLAVE)?;
         let times = self.times;
-        let job = self.job.as_mut().filter(|job| matches!(job.wait, Wait::Answer))?;
+        let job = self.job.as_mut().filter(|job| !matches!(job.wait, Wait::Sending))?;
         let wanted = match job.request {
             LssRequest::SwitchSelective(_) => cs::SWITCH_SELECTIVE_ANSWER,
             LssRequest::ConfigureNodeId(_) => cs::CONFIGURE_NODE_ID,
@@ -233,8 +233,13 @@ impl LssMaster {
         }
         match job.request {
             LssRequest::Fastscan(_) => {
-                job.wait = Wait::Settle;
-                job.due_ns = t_ns.saturating_add(u64::from(times.settle_ms) * MS);
+                // Answers of slower devices would be taken for those to the next question: the last one counts.
+                let until_ns = match job.wait {
+                    Wait::Settle { until_ns } => until_ns,
+                    _ => t_ns.saturating_add(u64::from(times.timeout_ms.max(1)) * MS),
+                };
+                job.wait = Wait::Settle { until_ns };
+                job.due_ns = t_ns.saturating_add(u64::from(times.settle_ms) * MS).min(until_ns);
                 None
             }
             LssRequest::ConfigureNodeId(_) | LssRequest::ConfigureBitTiming(_) | LssRequest::Store => self

@@ -122,6 +122,28 @@ fn a_lost_answer_ends_in_a_result_not_in_a_wrong_address() {
 }
 
 #[test]
+fn fastscan_waits_for_the_last_of_several_answers() {
+    const MS: u64 = 1_000_000;
+    let mut master = LssMaster::new(LssTimes::default());
+    let mut out = Outbox::default();
+    master.start(0, LssRequest::Fastscan(FastscanHint::default())).unwrap();
+    assert_eq!(master.on_time(0, &mut out), None);
+    assert_eq!(out.drain().count(), 1);
+    let answer = frame(0x7E4, cs::IDENTIFY_ANSWER, [0; 7]);
+    for ms in [3, 7, 11] {
+        assert_eq!(master.on_frame(ms * MS, &answer), None);
+        assert_eq!(master.next_deadline(), Some((ms + 5) * MS));
+    }
+    // Somebody who never stops is not waited for longer than for an answer.
+    for ms in 12..200 {
+        assert_eq!(master.on_frame(ms * MS, &answer), None);
+    }
+    assert_eq!(master.next_deadline(), Some(103 * MS));
+    assert_eq!(master.on_time(103 * MS, &mut out), None);
+    assert_eq!(master.next_deadline(), Some(103 * MS), "the next question goes");
+}
+
+#[test]
 fn selective_services() {
     let mut bus = Bus::new(vec![slave(1, 5), slave(2, 6)]);
     assert_eq!(bus.run(LssRequest::SwitchSelective(address(3))), LssResult::Nobody);

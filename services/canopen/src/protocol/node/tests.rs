@@ -1,5 +1,5 @@
 use super::*;
-use crate::protocol::cob_id::CobId;
+use crate::protocol::cob_id::{CobId, is_restricted};
 use crate::protocol::data_type::DataType;
 use crate::protocol::emcy::Emcy;
 use crate::protocol::error_control::MS;
@@ -249,6 +249,23 @@ fn sixty_four_bits_and_dummies() {
     assert_eq!(bench.value(0x2300, 1), 0, "the tenth bit");
     bench.frame(0x204, &[0x00, 0x02]);
     assert_eq!(bench.value(0x2300, 1), 1);
+}
+
+#[test]
+fn no_object_takes_a_restricted_identifier() {
+    let mut bench = Bench::new(4);
+    let objects = [(0x1005, 0), (0x1012, 0), (0x1014, 0), (0x1400, 1), (0x1800, 1)];
+    for (index, sub) in objects {
+        // Off, so that the identifier may change at all.
+        let off: u32 = if matches!(index, 0x1005 | 0x1012) { 0x80 } else { 0x8000_0080 };
+        assert_eq!(bench.sdo(index, sub, &off.to_le_bytes()), 0, "{index:04X}:{sub:02X}");
+        for id in (0..0x800u32).filter(|&id| is_restricted(id)) {
+            let abort = bench.sdo(index, sub, &id.to_le_bytes());
+            assert_eq!(abort, 0x0609_0030, "{index:04X}:{sub:02X} {id:03X}");
+            assert_eq!(bench.value(index, sub), u64::from(off), "{index:04X}:{sub:02X} {id:03X}");
+        }
+        assert_eq!(bench.sdo(index, sub, &0x6DFu32.to_le_bytes()), 0, "{index:04X}:{sub:02X}");
+    }
 }
 
 #[test]

@@ -88,6 +88,12 @@ impl Tpdo {
         }
     }
     fn send(&mut self, t_ns: u64, data: [u8; 8], out: &mut Outbox) {
+        if out.is_full() {
+            // It comes when there is room: an event-driven one at once, type 0 behind the next SYNC. A cyclic one comes again.
+            self.event |=
+                self.is_event_driven() || self.communication.transmission_type == kind::SYNC_ACYCLIC;
+            return;
+        }
         let len = usize::from(self.mapping.bytes());
         let mut frame = self.communication.cob.frame(&data[..len]);
         if self.is_cyclic() {
@@ -181,6 +187,51 @@ impl Tpdo {
     pub(super) fn on_time(&mut self, t_ns: u64, od: &ObjectDictionary, out: &mut Outbox) {
         if self.deadline().is_some_and(|due| t_ns >= due) {
             self.send(t_ns, self.mapping.pack(od), out);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::protocol::data_type::DataType;
+    use crate::protocol::od::{Access, EntryDef, OdBuilder};
+    use ipc_types::payload::CanFrame;
+
+    fn tpdo(transmission: u8) -> (ObjectDictionary, Tpdo) {
+        let rw = |data_type| EntryDef::new(data_type, Access::Rw);
+        let (u8_, u32_) = (DataType::Unsigned8, DataType::Unsigned32);
+        let mut b = OdBuilder::new();
+        b.record(
+            0x1800,
+            Access::Ro,
+            vec![(1, rw(u32_).value(0x185)), (2, rw(u8_).value(transmission.into()))],
+        );
+        b.record(0x1A00, Access::Rw, vec![(1, rw(u32_).value(0x2000_0008))]);
+        b.var(0x2000, rw(u8_).value(7).mappable());
+        let od = b.build(5).unwrap();
+        let tpdo = Tpdo::new(&od, 0);
+        assert!(tpdo.is_active());
+        (od, tpdo)
+    }
+
+    #[test]
+    fn what_finds_no_room_is_sent_later() {
+        for kind in [0, 1, 255] {
+            let (od, mut tpdo) = tpdo(kind);
+            let mut out = Outbox::default();
+            while !out.is_full() {
+                out.push(CanFrame::default());
+            }
+            tpdo.start(1, &od, false, &mut out);
+            tpdo.on_sync(2, &od, 0, &mut out);
+            assert_eq!(tpdo.deadline().is_some(), kind == 255, "type {kind}");
+            out.drain().for_each(drop);
+            tpdo.on_time(3, &od, &mut out);
+            tpdo.on_sync(4, &od, 0, &mut out);
+            let sent: Vec<_> = out.drain().map(|frame| (frame.can_id, frame.payload().to_vec())).collect();
+            assert_eq!((sent, out.dropped), (vec![(0x185, vec![7])], 0), "type {kind}");
+            assert_eq!(tpdo.deadline(), None, "type {kind}");
         }
     }
 }

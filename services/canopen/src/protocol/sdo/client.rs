@@ -96,7 +96,7 @@ impl SdoClient {
         self.channel = channel;
         self.reset();
     }
-    /// Other settings, from the next frame on.
+    /// Other settings, from the next transfer on; its times from the next frame on.
     pub fn set_config(&mut self, config: ClientConfig) {
         self.config = ClientConfig { block_size: config.block_size.clamp(1, MAX_BLOCK), ..config };
     }
@@ -216,8 +216,8 @@ impl SdoClient {
         if self.nudge.is_some_and(|nudge| t_ns >= nudge) {
             self.nudge = None;
             if let State::BlockUp { receiver, .. } = &mut self.state {
-                let seq = receiver.next();
-                self.acknowledge(seq, out);
+                let (seq, size) = (receiver.next(), receiver.size);
+                self.acknowledge(seq, size, out);
             }
         }
         None
@@ -270,9 +270,9 @@ impl SdoClient {
     fn send(&self, bytes: Bytes, out: &mut Outbox) {
         send(out, self.channel.request, bytes);
     }
-    fn acknowledge(&self, seq: u8, out: &mut Outbox) {
+    fn acknowledge(&self, seq: u8, size: u8, out: &mut Outbox) {
         let command = ccs::BLOCK_UP << 5 | BLOCK_ACK;
-        self.send([command, seq, self.config.block_size, 0, 0, 0, 0, 0], out);
+        self.send([command, seq, size, 0, 0, 0, 0, 0], out);
     }
     fn end(&mut self, result: Result<usize, Failure>) -> Finished {
         self.state = State::Idle;
@@ -510,9 +510,9 @@ impl SdoClient {
         self.state = State::BlockUp { receiver, size, crc };
         match step {
             Block::Wait => {}
-            Block::Acknowledge(seq) => self.acknowledge(seq, out),
+            Block::Acknowledge(seq) => self.acknowledge(seq, receiver.size, out),
             Block::Complete(seq) => {
-                self.acknowledge(seq, out);
+                self.acknowledge(seq, receiver.size, out);
                 self.state = State::BlockUpEnd { size, crc, last: receiver.last() };
             }
         }

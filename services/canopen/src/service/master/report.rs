@@ -103,6 +103,7 @@ impl Service {
             "network": self.network.counters(),
             "pdo": self.network.exchange.counters(),
             "queues": self.network.exchange.queues().collect::<Vec<_>>(),
+            "sync_late_us": { "last": self.sync_late_ns.0 / 1000, "max": self.sync_late_ns.1 / 1000 },
             "sync_out_us": { "last": self.sync_out_ns.0 / 1000, "max": self.sync_out_ns.1 / 1000 },
             "lss_jobs": self.network.lss.waiting(),
             "frames_dropped": self.ports.queue.dropped(),

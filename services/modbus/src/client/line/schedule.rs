@@ -131,6 +131,10 @@ impl Line {
                     SlotKind::Write => self.writes_in_a_row += 1,
                     SlotKind::Read => (self.writes_in_a_row, self.job_had_turn) = (0, false),
                 }
+                // Its first turn is the beginning of its periods, however long the clock runs.
+                if slot.due_ns == Some(0) {
+                    slot.due_ns = Some(now_ns);
+                }
                 (slot.unit, slot.pdu, slot.tries)
             }
             Origin::Job(id) => {

@@ -97,10 +97,13 @@ pub enum UnitState {
     /// Not asked yet.
     Unknown,
     Ok,
-    /// A request is being repeated.
+    /// The last try was not answered.
     Failing,
     /// Left alone between tries.
     Dead,
+    /// The port or connection does not work; only [`UnitView`] says so.
+    #[serde(rename = "no connection")]
+    NoConnection,
 }
 
 /// Counters of a unit.
@@ -123,7 +126,8 @@ pub struct UnitView {
     pub unit: u8,
     pub state: UnitState,
     pub counters: UnitCounters,
-    pub last_exception: Option<u8>,
+    /// Code of the last exception, and function of the request that it answered.
+    pub last_exception: Option<(u8, u8)>,
     pub last_rtt_ns: Option<u64>,
     pub max_rtt_ns: u64,
 }

@@ -12,12 +12,16 @@ pub(super) struct Unit {
     pub(super) retrying: Option<Origin>,
     pub(super) failed_ns: u64,
     pub(super) level: u32,
-    /// Line time of the tries since the unit was last well, of the last failure when dead.
+    /// Tries since the unit was last well.
+    pub(super) failures: u32,
+    /// That it is dead was told.
+    pub(super) told_dead: bool,
+    /// Line time of the last try without an answer.
     pub(super) cost_ns: u64,
     /// Requests whose late answers may still come.
     pub(super) suspects: [Suspect; SUSPECTS],
     pub(super) counters: UnitCounters,
-    pub(super) last_exception: Option<u8>,
+    pub(super) last_exception: Option<(u8, u8)>,
     pub(super) last_rtt_ns: Option<u64>,
     pub(super) max_rtt_ns: u64,
 }
@@ -45,6 +49,8 @@ impl Unit {
             retrying: None,
             failed_ns: 0,
             level: 0,
+            failures: 0,
+            told_dead: false,
             cost_ns: 0,
             suspects: [Suspect { pdu: Pdu::new(&[]), until_ns: 0, outstanding: 0, answered: false };
                 SUSPECTS],

@@ -53,13 +53,21 @@ impl Service {
             let message =
                 format!("{} does not answer; it is tried again from time to time", self.name_of(line, unit));
             self.tell(EventKind::BusState, Level::Warning, message);
-        } else if was_dead && answered {
+        } else if was_dead && answered && !is_dead {
             self.runners[line].dead.retain(|&d| d != unit);
             let message = format!("{} answers again", self.name_of(line, unit));
             self.tell(EventKind::BusState, Level::Info, message);
             // It may have been switched off: it gets its values again.
             let Self { writes, runners, write_slots, .. } = self;
-            writes.again(line, unit, now_ns, |i, pdu| set_write(runners, write_slots, i, pdu, now_ns));
+            writes.again(line, Some(unit), now_ns, |i, pdu| set_write(runners, write_slots, i, pdu, now_ns));
+        }
+    }
+
+    /// Writes all outputs of a connection whose server may have started again.
+    pub(super) fn rewrite(&mut self, line: usize, now_ns: u64) {
+        let Self { writes, runners, write_slots, .. } = self;
+        if runners[line].rewrite.take(now_ns) {
+            writes.again(line, None, now_ns, |i, pdu| set_write(runners, write_slots, i, pdu, now_ns));
         }
     }
 

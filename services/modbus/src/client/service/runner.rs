@@ -34,6 +34,30 @@ pub(super) struct Runner {
     /// Why the link does not work; `None`: it does, or was not needed.
     pub(super) trouble: Option<String>,
     pub(super) connected: bool,
+    pub(super) rewrite: Rewrite,
+}
+
+/// A server that ends every connection after one answer must not make endless writes of one.
+const REWRITE_PAUSE_NS: u64 = 10_000_000_000;
+
+/// When the outputs of a connection are written again because the server may have started again.
+#[derive(Default)]
+pub(super) struct Rewrite {
+    /// It ended the connection, and its outputs have not got their values since.
+    pub(super) wanted: bool,
+    last_ns: Option<u64>,
+}
+
+impl Rewrite {
+    /// Whether that is to be done now.
+    pub(super) fn take(&mut self, now_ns: u64) -> bool {
+        let pause = self.last_ns.is_some_and(|last_ns| now_ns.saturating_sub(last_ns) < REWRITE_PAUSE_NS);
+        if !self.wanted || pause {
+            return false;
+        }
+        (self.wanted, self.last_ns) = (false, Some(now_ns));
+        true
+    }
 }
 
 pub(super) fn runner(
@@ -82,7 +106,17 @@ pub(super) fn runner(
         batch_slots.push(slot);
         uses.push(Use::Batch(b));
     }
-    Ok(Runner { plan, line, transport, uses, batch_slots, dead: Vec::new(), trouble: None, connected: false })
+    Ok(Runner {
+        plan,
+        line,
+        transport,
+        uses,
+        batch_slots,
+        dead: Vec::new(),
+        trouble: None,
+        connected: false,
+        rewrite: Rewrite::default(),
+    })
 }
 
 /// Puts an answer into the inputs. True: the unit does not like the ranges in one request.
@@ -115,5 +149,21 @@ pub(super) fn set_write(runners: &mut [Runner], slots: &[(usize, usize)], i: usi
 pub(super) fn drop_write(runners: &mut [Runner], slots: &[(usize, usize)], i: usize) {
     if let Some(&(line, slot)) = slots.get(i) {
         runners[line].line.drop_write(slot);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn outputs_are_written_again_at_once_and_then_not_for_a_while() {
+        let mut rewrite = Rewrite::default();
+        assert!(!rewrite.take(1));
+        rewrite.wanted = true;
+        assert!(rewrite.take(1) && !rewrite.take(1));
+        rewrite.wanted = true;
+        assert!(!rewrite.take(REWRITE_PAUSE_NS));
+        assert!(rewrite.take(REWRITE_PAUSE_NS + 1) && !rewrite.take(u64::MAX));
     }
 }

@@ -85,14 +85,9 @@ impl Live {
         if self.engine.forces().next().is_some() {
             ctx.event(EventKind::Forced, Level::Info, "nothing forced any more: a new program", Value::Null);
         }
-        let had_retain_file = self.disk.is_some();
         self.engine = engine;
         self.retain_layout = layout;
-        if !self.engine.retain().is_empty() && !had_retain_file {
-            tracing::warn!(
-                "the new program's RETAIN variables are copied to disk only after a restart of the service"
-            );
-        }
+        self.copy_to_disk();
         self.orders.clear();
         // What waited was meant for the old program.
         for asker in std::mem::take(&mut self.replies) {

@@ -71,10 +71,20 @@ impl Live {
         self.counters.faults += 1;
         let mut detail = serde_json::to_value(fault).unwrap_or(Value::Null);
         detail["scan"] = json!(self.engine.scan());
-        ctx.event(EventKind::ProgramFault, Level::Fault, format!("program fault: {}", fault.message), detail);
+        let restarts = restart_of(self.config.on_fault).is_some();
+        let next = if restarts {
+            "it starts again in a second (on_fault)".to_owned()
+        } else {
+            let service = &ctx.service;
+            format!(
+                "`dinrail plc run --service {service}` starts it again, RETAIN kept; `dinrail plc load` another program"
+            )
+        };
+        let message = format!("program fault: {}; {next}", fault.message);
+        ctx.event(EventKind::ProgramFault, Level::Fault, message, detail);
         ctx.set_state(HealthState::Degraded);
         self.keyframe_wanted = Some(Reason::Trap);
-        if restart_of(self.config.on_fault).is_some() {
+        if restarts {
             self.restart_at_ns = Some(now_ns + RESTART_NS);
         }
     }
