@@ -466,6 +466,10 @@ fn eight_devices() {
     timed("fastscan", || fastscan_finds_eight(&stack, 10, 1, &["--timeout", "200"]));
     let scanned = stack.ok(&["canopen", "scan"]);
     assert!((10..=17).all(|node| scanned.lines().any(|l| l.starts_with(&node.to_string()))), "{scanned}");
+    assert_eq!(stack.take_down(), 0, "{}", stack.log());
+    // Frames that seven others would look at, too, take three times as long here.
+    let text = [BUS, ALONE, &slave("device", 10, "serial_number = 1")].concat();
+    let mut stack = timed("one device", || Stack::up("vcone", &text, &[]));
     // Of each direction what the receiver says is heard: 1200 frames of 150,000.
     let value = long_value(1 << 20);
     let server = Witness::candump(&["58A"]);

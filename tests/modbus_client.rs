@@ -427,7 +427,7 @@ fn the_command_line_alone_reads_a_device() {
     let (ok, text) = run(&["read", &target, "40001x3", "30011:int16", "Coil=00002"]);
     assert!(ok && text.contains("102") && text.contains("10") && text.contains("on"), "{text}");
     let (ok, text) = run(&["write", &target, "40010:float:CDAB=-2.25"]);
-    assert!(ok && text.contains("40010: 1 written"), "{text}");
+    assert!(ok && text.contains("40010: 1 value written"), "{text}");
     let (ok, text) = run(&["read", &target, "40010:float:CDAB", "--every", "10ms", "--rounds", "2"]);
     assert!(ok && text.matches("-2.25").count() == 2, "{text}");
     let (ok, text) = run(&["identify", &target]);

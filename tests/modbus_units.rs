@@ -139,8 +139,8 @@ fn a_dead_unit_among_ten_costs_the_others_less_than_5_percent() {
     let stack = Stack::up("mbten", &toml, &[]);
     let nine = units(&stack, 1, &[], Duration::ZERO);
     let ten = units(&stack, 2, &[10], Duration::ZERO);
-    // Two tries, then it is dead and only looked at.
-    stack.wait("the dead unit is known", || (ten.by_unit()[10] >= 3).then_some(()));
+    // Four tries, then it is dead and only looked at.
+    stack.wait("the dead unit is known", || (ten.by_unit()[10] >= 5).then_some(()));
     let mut told = Vec::new();
     // A live unit that the machine keeps from answering for two timeouts costs its line more than the dead one does:
     // then the next window counts.

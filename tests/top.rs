@@ -240,7 +240,7 @@ fn top_ends_with_its_terminal_and_by_every_signal() {
     let mut screen = Screen::open(&stack.name, 80, 24);
     screen.wait_for("SERVICE");
     screen.master = std::fs::File::open("/dev/null").unwrap();
-    screen.wait_for_exit();
+    assert_eq!(screen.wait_for_exit().code(), Some(0));
 
     let mut screen = Screen::open(&stack.name, 80, 24);
     screen.wait_for("SERVICE");

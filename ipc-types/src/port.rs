@@ -75,10 +75,10 @@ impl<H: Payload> Publisher<H> {
             .allocation_strategy(AllocationStrategy::Static)
             .max_loaned_samples(2);
         // A full queue is told to the writer at once: blocking would hang on a dead reader for ever.
-        let port = builder
-            .set_backpressure_handler(|_| BackpressureAction::DiscardDataAndFail)
-            .create()
-            .map_err(|e| RailError::port(format!("publisher on '{}'", topic.name), topic.max_publishers, e))?;
+        let port =
+            builder.set_backpressure_handler(|_| BackpressureAction::DiscardDataAndFail).create().map_err(
+                |e| RailError::port(format!("publisher on '{}'", topic.name), topic.max_publishers, e),
+            )?;
         Ok(Self {
             port,
             factory,
@@ -264,11 +264,9 @@ pub struct Subscriber<H: Payload> {
 impl<H: Payload> Subscriber<H> {
     pub(crate) fn new(node: &Node<Svc>, topic: &TopicEntry) -> Result<Self, RailError> {
         let factory = open::<H>(node, topic)?;
-        let port = factory
-            .subscriber_builder()
-            .buffer_size(topic.depth as usize)
-            .create()
-            .map_err(|e| RailError::port(format!("subscriber on '{}'", topic.name), topic.max_subscribers, e))?;
+        let port = factory.subscriber_builder().buffer_size(topic.depth as usize).create().map_err(|e| {
+            RailError::port(format!("subscriber on '{}'", topic.name), topic.max_subscribers, e)
+        })?;
         // Connects at once: history is handed over and a refusing writer sees its reader.
         let _ = port.has_samples();
         Ok(Self {

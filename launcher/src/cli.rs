@@ -165,9 +165,11 @@ pub enum Command {
     /// JSON schema of stack files, for editors
     Schema,
     /// Script that completes commands and options in a shell
-    #[command(after_help = "bash:  dinrail completion bash > ~/.local/share/bash-completion/completions/dinrail\n\
+    #[command(
+        after_help = "bash:  dinrail completion bash > ~/.local/share/bash-completion/completions/dinrail\n\
         zsh:   dinrail completion zsh > DIR/_dinrail, DIR being in $fpath\n\
-        fish:  dinrail completion fish > ~/.config/fish/completions/dinrail.fish")]
+        fish:  dinrail completion fish > ~/.config/fish/completions/dinrail.fish"
+    )]
     Completion { shell: crate::commands::completion::Shell },
     /// Write manual pages of all commands into a folder
     Man { folder: PathBuf },

@@ -230,8 +230,14 @@ impl Bench {
             if let Some(seconds) = self.seconds {
                 child.args(["--seconds", &seconds.to_string()]);
             }
-            let output = child.arg("--dir").arg(&self.dir).output().context("starting a part of the bench")?;
-            ensure!(output.status.success(), "{} could not be run, {}; see above", part.name(), output.status);
+            let output =
+                child.arg("--dir").arg(&self.dir).output().context("starting a part of the bench")?;
+            ensure!(
+                output.status.success(),
+                "{} could not be run, {}; see above",
+                part.name(),
+                output.status
+            );
             let report: Report =
                 serde_json::from_slice(&output.stdout).context("reading the report of a part")?;
             let what = self.what.name();

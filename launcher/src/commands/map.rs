@@ -6,7 +6,7 @@ use anyhow::Context as _;
 use dinrail_iec::artifact::{AreaKind, Storage, VarKind};
 use dinrail_iec::{Addressing, LocatedAddress};
 use dinrail_modbus::map::RegisterMap;
-use dinrail_modbus::map_config::{MapConfig, MapRow, traditional_number};
+use dinrail_modbus::map_config::{MapConfig, MapRow, WordOrder, traditional_number};
 use dinrail_modbus::server::Table;
 use dinrail_modbus::service::addressing_of;
 use dinrail_plc::program;
@@ -66,6 +66,9 @@ struct Register {
     /// For a bit that only a register shows: its number there, 0 to 15.
     #[serde(skip_serializing_if = "Option::is_none")]
     bit: Option<u8>,
+    /// For values of more than one register: the order of their bytes, A the most significant. CDAB is low word first.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    order: Option<&'static str>,
 }
 
 /// Registers of one server, or of one of its units, for what no field service exchanges.
@@ -213,6 +216,7 @@ fn registers(shown: &Shown, (area, byte, bit): (Area, u32, Option<u8>)) -> Vec<R
         address: at,
         number: traditional_number(table, at),
         bit,
+        order: None,
     };
     let direct: Vec<Register> =
         map.entries_at(area, byte, bit).into_iter().map(|entry| register(entry, None)).collect();
@@ -226,9 +230,57 @@ fn registers(shown: &Shown, (area, byte, bit): (Area, u32, Option<u8>)) -> Vec<R
     entries.map(|entry| register(entry, Some(if swapped(entry) { bit ^ 8 } else { bit }))).collect()
 }
 
+/// Whether the values of a range take more than one register.
+fn is_wide(range: &ImageRange) -> bool {
+    let Some(name) = range.type_name.as_deref() else { return matches!(range.bytes, 4 | 8) };
+    // `10 x REAL`.
+    let element = name.rsplit(' ').next().unwrap_or_default();
+    let wide = [
+        "DWORD",
+        "UDINT",
+        "DINT",
+        "REAL",
+        "LWORD",
+        "ULINT",
+        "LINT",
+        "LREAL",
+        "TIME",
+        "LTIME",
+        "DATE",
+        "TOD",
+        "DT",
+        "TIME_OF_DAY",
+        "DATE_AND_TIME",
+    ];
+    wide.contains(&element)
+}
+
+/// The order of bytes in which a map shows values of several registers.
+fn order(rows: &[MapRow], register: &Register) -> Option<&'static str> {
+    let holds =
+        |r: &&MapRow| r.table.name() == register.table && (r.first..=r.last).contains(&register.address);
+    let row = rows.iter().find(holds).filter(|row| !row.table.is_bits())?;
+    // The image has the low word first; single registers show it as it is.
+    let high_first = row.word_order == Some(WordOrder::HighFirst);
+    Some(match (high_first, row.swap_bytes) {
+        (true, false) => "ABCD",
+        (true, true) => "BADC",
+        (false, false) => "CDAB",
+        (false, true) => "DCBA",
+    })
+}
+
 fn point(plc: &ServiceEntry, entry: &ServiceEntry, range: &ImageRange, role: Role, maps: &[Shown]) -> Point {
     let at = LocatedAddress::new(range.area.letter(), range.byte, range.bit, range.bytes);
-    let modbus = maps.iter().flat_map(|map| registers(map, (range.area, range.byte, range.bit))).collect();
+    let mut modbus: Vec<Register> = Vec::new();
+    for map in maps {
+        let first = modbus.len();
+        modbus.extend(registers(map, (range.area, range.byte, range.bit)));
+        if is_wide(range) {
+            let rows = map.map.rows(Addressing::Element);
+            modbus[first..].iter_mut().for_each(|register| register.order = order(&rows, register));
+        }
+    }
     Point {
         plc: plc.name.clone(),
         element: at.and_then(|at| at.text(Addressing::Element)),
@@ -255,7 +307,8 @@ fn row(point: &Point) -> Vec<String> {
             let server = r.server.as_ref().filter(|_| several).map(|s| format!("{s}: ")).unwrap_or_default();
             let unit = r.unit.map(|unit| format!("unit {unit} ")).unwrap_or_default();
             let bit = r.bit.map(|b| format!("bit {b} of ")).unwrap_or_default();
-            format!("{server}{unit}{bit}{} {} ({})", r.table, r.address, r.number)
+            let order = r.order.map(|order| format!(" {order}")).unwrap_or_default();
+            format!("{server}{unit}{bit}{} {} ({}){order}", r.table, r.address, r.number)
         })
         .collect();
     let or_dash = |text: &Option<String>| text.clone().unwrap_or_else(|| "-".to_owned());
@@ -300,11 +353,7 @@ fn text(points: &[Point], servers: &[ServerMap]) -> String {
             .map(|r| {
                 let notes = [
                     r.word_order.map(|o| {
-                        if o == dinrail_modbus::map_config::WordOrder::HighFirst {
-                            "high word first"
-                        } else {
-                            "low word first"
-                        }
+                        if o == WordOrder::HighFirst { "high word first" } else { "low word first" }
                     }),
                     r.swap_bytes.then_some("bytes swapped"),
                     Some(if r.writable { "read, write" } else { "read" }),
@@ -389,7 +438,7 @@ mod tests {
         let shown = points.iter().map(|p| row(p).join(" | ")).find(|row| row.contains("%MD10")).unwrap();
         assert_eq!(
             shown,
-            "%MD10 | %MD40 | %MB40 to %MB43 | - | - | holding_registers 20 (40021), unit 5 holding_registers 7 (40008) | unit 5 holding_registers 7-8 | to modbus"
+            "%MD10 | %MD40 | %MB40 to %MB43 | - | - | holding_registers 20 (40021) CDAB, unit 5 holding_registers 7 (40008) ABCD | unit 5 holding_registers 7-8 | to modbus"
         );
         let shown = text(&points, &servers);
         assert!(shown.contains("\nregisters of unit 5 of 'modbus' over the image of 'plc'\n"), "{shown}");

@@ -50,20 +50,24 @@ impl Program {
         }
         let Some(stack) = &args.stack else {
             return Ok(Self {
-                sources: read_sources(&args.files)?,
+                sources: read_sources(Path::new(""), &args.files)?,
                 setup: Setup::default(),
                 of_stack: false,
             });
         };
         let (setup, dir) = setup_of(stack, args.service.as_deref())?;
-        let own: Vec<PathBuf> = setup.files.iter().map(|file| dir.join(file)).collect();
-        let files = if args.files.is_empty() { &own } else { &args.files };
+        // Named as the stack names them, so that it is the same program.
+        let (files, dir) = if args.files.is_empty() {
+            (setup.files.iter().map(PathBuf::from).collect(), dir)
+        } else {
+            (args.files.clone(), PathBuf::new())
+        };
         anyhow::ensure!(
             !files.is_empty(),
             "the plc of {} has no program: name source files",
             stack.display()
         );
-        Ok(Self { sources: read_sources(files)?, setup, of_stack: true })
+        Ok(Self { sources: read_sources(&dir, &files)?, setup, of_stack: true })
     }
 
     /// Compiles; what is wrong goes to stderr with its source lines, and `none` is the error's text.
@@ -73,13 +77,13 @@ impl Program {
             Ok(compiled) => {
                 let warnings = compiled.render_warnings(&self.sources, color);
                 if !warnings.is_empty() {
-                    say_coloured(&warnings);
+                    say_coloured(warnings.trim_end());
                 }
                 Ok(compiled)
             }
             Err(diagnostics) => {
                 let shown = diagnostics.render(color);
-                say_coloured(&shown);
+                say_coloured(shown.trim_end());
                 anyhow::bail!("{none}{}", self.advice(&shown))
             }
         }
@@ -124,11 +128,12 @@ fn setup_of(path: &Path, service: Option<&str>) -> anyhow::Result<(Setup, PathBu
     Ok((program::setup(&config, &stack, plc), stack.dir))
 }
 
-fn read_sources(files: &[PathBuf]) -> anyhow::Result<Vec<Source>> {
-    files.iter().map(|file| read_source(file)).collect()
+/// Reads files of a folder; they are named as given.
+fn read_sources(dir: &Path, files: &[PathBuf]) -> anyhow::Result<Vec<Source>> {
+    files.iter().map(|file| read_source(&dir.join(file), file.display().to_string())).collect()
 }
 
-fn read_source(file: &Path) -> anyhow::Result<Source> {
+fn read_source(file: &Path, name: String) -> anyhow::Result<Source> {
     let shown = file.display();
     let size = std::fs::metadata(file).with_context(|| format!("cannot read {shown}"))?.len();
     anyhow::ensure!(size <= SOURCE_MAX, "{shown} has {size} bytes; a source file has at most {SOURCE_MAX}");
@@ -136,7 +141,7 @@ fn read_source(file: &Path) -> anyhow::Result<Source> {
     let text = String::from_utf8(bytes).map_err(|e| {
         anyhow::anyhow!("{shown}: byte {} is no UTF-8; is this a source file?", e.utf8_error().valid_up_to())
     })?;
-    Ok(Source { name: shown.to_string(), text })
+    Ok(Source { name, text })
 }
 
 #[cfg(test)]
@@ -167,7 +172,7 @@ mod tests {
         assert!(said.ends_with("give that with --stack STACK"), "{said}");
         // Its own program.
         let own = Program::read(&args(&[], Some(stack.clone()))).unwrap();
-        assert!(own.sources[0].name.ends_with("main.st"), "{}", own.sources[0].name);
+        assert_eq!(own.sources[0].name, "main.st");
         let said = Program::read(&args(&[stack], None)).err().unwrap().to_string();
         assert!(said.contains("is a stack, no source file: write --stack "), "{said}");
     }

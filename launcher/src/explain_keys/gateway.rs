@@ -65,8 +65,8 @@ pub const MODBUS_SERVER: &[KeyDoc] = &[
     with(
         "tcp.when_full",
         Choice(&["refuse", "close_oldest_idle"]),
-        "\"refuse\"",
-        "What a new client gets when `tcp.max_connections` is reached: refused, or the place of the client that has been idle longest.",
+        "\"close_oldest_idle\"",
+        "What a new client gets when `tcp.max_connections` is reached: refused, or the place of the client that has been idle longest, if that is at least 1 s.",
     ),
     may("rtu_over_tcp", Table, "not served", "RTU frames on a TCP connection, as port servers send them."),
     need("rtu_over_tcp.port", Int(0, 65535), "TCP port."),
@@ -101,7 +101,7 @@ pub const MODBUS_SERVER: &[KeyDoc] = &[
     with(
         "rtu_over_tcp.when_full",
         Choice(&["refuse", "close_oldest_idle"]),
-        "\"refuse\"",
+        "\"close_oldest_idle\"",
         "As `tcp.when_full`.",
     ),
     with("serial", Tables, "[]", "Serial lines that are served, at most 8."),

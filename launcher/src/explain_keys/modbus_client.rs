@@ -40,7 +40,7 @@ pub const MODBUS_CLIENT: &[KeyDoc] = &[
         "probe_min",
         Duration,
         "\"1s\"",
-        "First pause between tries of a unit that does not answer; it doubles each time, and is at least 25 times what a try costs while other units are alive.",
+        "First pause between tries of a unit that has not answered three tries in a row; it doubles each time, and is at least 25 times what the last try took while another unit of the line is alive (25 s after a timeout of 1 s).",
     ),
     with("probe_max", Duration, "\"1min\"", "Longest such pause."),
     with(
@@ -170,8 +170,8 @@ pub const MODBUS_GATEWAY: &[KeyDoc] = &[
     with(
         "tcp.when_full",
         Choice(&["refuse", "close_oldest_idle"]),
-        "\"refuse\"",
-        "What a new master gets when `tcp.max_connections` is reached: refused, or the place of the one idle longest.",
+        "\"close_oldest_idle\"",
+        "What a new master gets when `tcp.max_connections` is reached: refused, or the place of the one idle longest, if that is at least 1 s.",
     ),
     may(
         "serial",
@@ -224,7 +224,7 @@ pub const MODBUS_GATEWAY: &[KeyDoc] = &[
         "probe_min",
         Duration,
         "\"1s\"",
-        "A unit that did not answer is not tried again for so long, doubled each time; requests get exception 0B at once.",
+        "A unit that has not answered three tries in a row is not tried again for so long, doubled each time, and while another unit of the line is alive not before 25 times what the last try took (25 s after a timeout of 1 s); meanwhile requests to it get exception 0B at once.",
     ),
     with("probe_max", Duration, "\"1min\"", "Longest such pause."),
     with("cache", Tables, "[]", "Ranges that the gateway reads by itself and answers from memory."),

@@ -67,7 +67,8 @@ fn points_of<'a>(document: &Document, stack: &'a Stack, plc: &str) -> Vec<Point<
             wiring.inputs.iter().map(|r| (r, true)).chain(wiring.outputs.iter().map(|r| (r, false)))
         {
             let place = document.place(&entry.name, &range.key);
-            let beside = |name| beside(document, &entry.name, &range.key, name).unwrap_or_else(|| place.clone());
+            let beside =
+                |name| beside(document, &entry.name, &range.key, name).unwrap_or_else(|| place.clone());
             let (symbol, status) = (beside("symbol"), beside("status_to"));
             points.push(Point { service: &entry.name, range, owned, place, symbol, status });
         }
@@ -224,7 +225,11 @@ fn symbols(points: &[Point<'_>], sink: &mut Sink<'_>) {
             first.describe(sink),
             point.describe(sink)
         );
-        sink.error(&point.symbol, message, "give one of them another name; upper and lower case are the same");
+        sink.error(
+            &point.symbol,
+            message,
+            "give one of them another name; upper and lower case are the same",
+        );
     }
 }
 

@@ -117,7 +117,8 @@ fn common_slip(text: &str, span: &Range<usize>) -> Option<(Range<usize>, String,
     let (key, value) = line.split_once('=')?;
     let plain = |c: char| c.is_alphanumeric() || matches!(c, '_' | '-' | '.' | ':' | '/' | '%');
     let word = value.split('#').next().unwrap_or_default().trim();
-    let bare = word.starts_with(|c: char| c.is_alphabetic() || matches!(c, '/' | '%')) && word.chars().all(plain);
+    let bare =
+        word.starts_with(|c: char| c.is_alphabetic() || matches!(c, '/' | '%')) && word.chars().all(plain);
     let key = key.trim();
     if !bare || key.is_empty() || !key.chars().all(plain) || ["true", "false", "inf", "nan"].contains(&word) {
         return None;
@@ -162,7 +163,14 @@ fn read_stack(root: &Table, sink: &mut Sink<'_>) -> Option<(String, StackTable)>
         return None;
     }
     let name_span = keypath::span_of(&table, "name").unwrap_or_else(|| header.clone());
-    let scope = Scope { what: "[stack]", explain: "stack", keys: STACK_DOCS, more_keys: &[], kinds: &[], place: header };
+    let scope = Scope {
+        what: "[stack]",
+        explain: "stack",
+        keys: STACK_DOCS,
+        more_keys: &[],
+        kinds: &[],
+        place: header,
+    };
     let stack: StackTable =
         read_table(table, &scope, sink, |t| toml_edit::de::from_document(DocumentMut::from(t)))?;
     if let Some(fault) = name_fault(&stack.name) {
@@ -201,11 +209,7 @@ fn read_services(
         Some(other) => {
             let key = root.key("service").and_then(|k| k.span());
             let span = other.span().or(key).unwrap_or_default();
-            sink.error(
-                &span,
-                "'service' is no list of tables",
-                ONE_BRACKET,
-            );
+            sink.error(&span, "'service' is no list of tables", ONE_BRACKET);
             return Vec::new();
         }
         None => {

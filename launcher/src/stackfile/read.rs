@@ -131,14 +131,14 @@ fn report(error: &Error, table: &Table, scope: &Scope<'_>, sink: &mut Sink<'_>) 
 fn address_fault(quoted: &str) -> String {
     let text = quoted.trim_matches(['"', '\'']);
     match text.rsplit_once(':') {
-        Some((host, port)) if port.parse::<u16>().is_ok() && host.contains(|c: char| c.is_ascii_alphabetic()) => {
+        Some((host, port))
+            if port.parse::<u16>().is_ok() && host.contains(|c: char| c.is_ascii_alphabetic()) =>
+        {
             format!("'{host}' is no IP address; names of hosts are not supported, write the number")
         }
         _ if text.parse::<std::net::IpAddr>().is_ok() => {
-            format!("the port is missing: write \"{}\"", match text.contains(':') {
-                true => format!("[{text}]:PORT"),
-                false => format!("{text}:PORT"),
-            })
+            let host = if text.contains(':') { format!("[{text}]") } else { text.to_owned() };
+            format!("the port is missing: write \"{host}:PORT\"")
         }
         _ => "expected an address and a port, as \"192.168.0.10:502\"".to_owned(),
     }

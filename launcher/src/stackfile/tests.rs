@@ -288,10 +288,7 @@ fn keys() {
         ("unknown key, near one of the launcher", one("hang_timeot = \"1s\"")),
         ("two unknown keys in one table", one("cicle = \"1ms\"\nplcs = \"x\"")),
         ("unknown key in an inner table", one("in = [{ byte = 0 }, { byte = 1, symbl = \"x\" }]")),
-        (
-            "table below the wrong service",
-            format!("{}[[service.cycle]]\nx = 1\n", stack("")),
-        ),
+        ("table below the wrong service", format!("{}[[service.cycle]]\nx = 1\n", stack(""))),
         ("unknown key of the launcher's table", one("restart = { maxx = 3 }")),
         (
             "unknown key in [stack]",
@@ -395,7 +392,10 @@ fn conflicts() {
             "symbol twice",
             stack("in = [{ byte = 0, symbol = \"Speed\" }]\nout = [{ byte = 0, symbol = \"SPEED\" }]"),
         ),
-        ("symbols that are no names", stack("in = [{ byte = 0, symbol = \"IF\" }, { byte = 1, symbol = \"volt raw\" }]")),
+        (
+            "symbols that are no names",
+            stack("in = [{ byte = 0, symbol = \"IF\" }, { byte = 1, symbol = \"volt raw\" }]"),
+        ),
         ("port twice", listening("127.0.0.1:502", "127.0.0.1:502")),
         ("port of all addresses", listening("0.0.0.0:502", "127.0.0.1:502")),
         ("missing file", bus("file = \"capture.log\"")),

@@ -450,7 +450,8 @@ async fn work(
                 // First cleared, then drained: what rings in between is an arrival again.
                 rang.map_err(system("waiting for the rail"))?.clear_ready();
                 inbox.drain();
-                more = true;
+                // At once, not by another pass of the loop: it would cost every frame out a look at all descriptors.
+                more = hub.turn(|bus, rail, now_ns| rail.take_tx(bus, now_ns));
             }
             // One turn at a time, so that writers that never pause keep neither the heartbeat nor the end waiting.
             () = tokio::task::yield_now(), if more => {

@@ -56,7 +56,7 @@ impl Default for Tcp {
             max_connections: 8,
             filter: None,
             idle_timeout: Span::from_ms(60_000),
-            when_full: WhenFull::Refuse,
+            when_full: WhenFull::default(),
         }
     }
 }

@@ -36,6 +36,7 @@ pub mod tcp;
 #[cfg(test)]
 mod testing;
 pub mod view;
+mod visits;
 pub mod watchdog;
 pub mod write_set;
 

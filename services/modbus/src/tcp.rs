@@ -9,6 +9,7 @@ use crate::device::Device;
 use crate::rights::Peer;
 use crate::server::Image;
 use crate::session::{Framing, MAX_EXCEPTION, Next, Session, SessionCounts};
+use crate::visits::{Visits, leaving_is_told, untold_words};
 use ipc_types::clock;
 use ipc_types::net::Seldom;
 use serde::{Deserialize, Serialize};
@@ -51,10 +52,10 @@ pub trait Backend: Image {
 #[serde(rename_all = "snake_case")]
 pub enum WhenFull {
     /// The new connection is closed.
-    #[default]
     Refuse,
     /// The connection that has been without a request for longest, at least [`Options::min_idle`], makes room;
     /// without such a one the new connection is closed.
+    #[default]
     CloseOldestIdle,
 }
 
@@ -78,7 +79,7 @@ impl Default for Options {
             filter: Admission::default(),
             framing: Framing::Tcp,
             idle_timeout: Some(Duration::from_mins(1)),
-            when_full: WhenFull::Refuse,
+            when_full: WhenFull::default(),
             min_idle: Duration::from_secs(1),
         }
     }
@@ -181,9 +182,21 @@ pub struct ClientInfo {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Happening {
-    Connected { peer: SocketAddr },
-    Refused { peer: SocketAddr, why: Refusal },
-    Left { peer: SocketAddr, why: CloseReason, requests: u64, exceptions: u64 },
+    /// `untold`: connections of the same address before it that were not told.
+    Connected {
+        peer: SocketAddr,
+        untold: u32,
+    },
+    Refused {
+        peer: SocketAddr,
+        why: Refusal,
+    },
+    Left {
+        peer: SocketAddr,
+        why: CloseReason,
+        requests: u64,
+        exceptions: u64,
+    },
 }
 
 /// Why a connection was closed before a byte was read.
@@ -198,7 +211,9 @@ pub enum Refusal {
 impl fmt::Display for Happening {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Connected { peer } => write!(f, "Modbus client {peer} connected"),
+            Self::Connected { peer, untold } => {
+                write!(f, "Modbus client {peer} connected{}", untold_words(*untold))
+            }
             Self::Refused { peer, why: Refusal::Filter } => {
                 write!(f, "Modbus client {peer} refused: the filter does not admit its address")
             }
@@ -250,6 +265,7 @@ pub struct Hub<B> {
     enabled: Cell<bool>,
     clients: RefCell<Vec<Rc<Client>>>,
     counters: Cell<Counters>,
+    visits: RefCell<Visits>,
     happenings: RefCell<Vec<Happening>>,
     happenings_left_out: Cell<u64>,
 }
@@ -264,6 +280,7 @@ impl<B: Backend + 'static> Hub<B> {
             enabled: Cell::new(true),
             clients: RefCell::new(Vec::new()),
             counters: Cell::new(Counters::default()),
+            visits: RefCell::default(),
             happenings: RefCell::new(Vec::with_capacity(MAX_HAPPENINGS)),
             happenings_left_out: Cell::new(0),
         })
@@ -401,7 +418,11 @@ impl<B: Backend + 'static> Hub<B> {
         }
         keep_alive(&stream);
         self.update(|counters| counters.accepted += 1);
-        self.happened(Happening::Connected { peer });
+        let arrival = self.visits.borrow_mut().arrives(peer.ip(), clock::mono_ns());
+        match arrival {
+            Some(untold) => self.happened(Happening::Connected { peer, untold }),
+            None => tracing::debug!("Modbus client {peer} connected"),
+        }
         let now = Instant::now();
         let client = Rc::new(Client {
             peer,
@@ -418,7 +439,13 @@ impl<B: Backend + 'static> Hub<B> {
             hub.clients.borrow_mut().retain(|other| !Rc::ptr_eq(other, &client));
             hub.update(|counters| counters.closed(reason));
             let SessionCounts { requests, exceptions, .. } = client.counts.get();
-            hub.happened(Happening::Left { peer, why: reason, requests, exceptions });
+            let left = Happening::Left { peer, why: reason, requests, exceptions };
+            let lasted_ns = client.since.elapsed().as_nanos() as u64;
+            if leaving_is_told(arrival, lasted_ns) {
+                hub.happened(left);
+            } else {
+                tracing::debug!("{left}");
+            }
         });
     }
 

@@ -191,7 +191,8 @@ fn filter(start: &str, end: &str) -> Admission {
 
 #[test]
 fn connections_beyond_the_limit_are_refused_until_one_leaves() {
-    with_server(Options { max_connections: 2, ..Options::default() }, |hub, address| async move {
+    let options = Options { max_connections: 2, when_full: WhenFull::Refuse, ..Options::default() };
+    with_server(options, |hub, address| async move {
         let a = TcpStream::connect(address).await.unwrap();
         let mut b = TcpStream::connect(address).await.unwrap();
         until(|| hub.clients().len() == 2).await;
@@ -206,9 +207,11 @@ fn connections_beyond_the_limit_are_refused_until_one_leaves() {
         d.write_all(&frame(1, 1, "03 0000 0001")).await.unwrap();
         read_answer(&mut d).await.unwrap();
         let (happened, left_out) = hub.take_happenings();
-        assert_eq!(happened.len(), 5, "{happened:?}");
-        assert!(matches!(happened[2], Happening::Refused { why: Refusal::Full, .. }));
-        assert!(matches!(happened[3], Happening::Left { why: CloseReason::Peer, .. }));
+        // Of an address the first connection is told.
+        assert_eq!(happened.len(), 3, "{happened:?}");
+        assert!(matches!(happened[0], Happening::Connected { untold: 0, .. }));
+        assert!(matches!(happened[1], Happening::Refused { why: Refusal::Full, .. }));
+        assert!(matches!(happened[2], Happening::Left { why: CloseReason::Peer, .. }));
         assert_eq!(left_out, 0);
     });
 }
@@ -325,7 +328,8 @@ fn switched_off_it_closes_and_refuses_and_on_again_it_serves() {
 
 #[test]
 fn a_flood_of_connections_does_not_flood_the_rail() {
-    with_server(Options { max_connections: 1, ..Options::default() }, |hub, address| async move {
+    let options = Options { max_connections: 1, when_full: WhenFull::Refuse, ..Options::default() };
+    with_server(options, |hub, address| async move {
         let _a = TcpStream::connect(address).await.unwrap();
         for _ in 0..50 {
             let mut refused = TcpStream::connect(address).await.unwrap();
@@ -341,7 +345,8 @@ fn a_flood_of_connections_does_not_flood_the_rail() {
 fn happenings_are_sentences() {
     let peer: SocketAddr = "192.168.1.20:50000".parse().unwrap();
     let text = [
-        Happening::Connected { peer },
+        Happening::Connected { peer, untold: 0 },
+        Happening::Connected { peer, untold: 59 },
         Happening::Refused { peer, why: Refusal::Filter },
         Happening::Refused { peer, why: Refusal::Full },
         Happening::Refused { peer, why: Refusal::Disabled },
@@ -353,6 +358,7 @@ fn happenings_are_sentences() {
     .concat();
     insta::assert_snapshot!(text, @r#"
 Modbus client 192.168.1.20:50000 connected
+Modbus client 192.168.1.20:50000 connected (59 more connections of this address in between)
 Modbus client 192.168.1.20:50000 refused: the filter does not admit its address
 Modbus client 192.168.1.20:50000 refused: max_connections are in use
 Modbus client 192.168.1.20:50000 refused: the server is switched off

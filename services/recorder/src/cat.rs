@@ -7,9 +7,9 @@ use crate::utc;
 use ipc_types::payload::{CanFrame, can_flag, fd_flag, from_bytes, id_flag};
 use ipc_types::topic::TopicKind;
 use serde_json::{Map, Value, json};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// How messages are printed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -49,6 +49,8 @@ pub enum CatError {
     Read(#[from] ReadError),
     #[error("writing the output failed: {0}")]
     Write(#[from] io::Error),
+    #[error("{path}: no topic '{topic}'; there are: {there}")]
+    NoTopic { path: PathBuf, topic: String, there: String },
 }
 
 /// What was printed.
@@ -64,9 +66,13 @@ pub fn cat(path: &Path, filter: &Filter, format: Format, out: &mut impl Write) -
     let mut recording = Recording::open(path)?;
     let mut layouts: BTreeMap<u16, Option<Layout>> = BTreeMap::new();
     let mut messages = 0;
+    let mut seen: BTreeSet<String> = BTreeSet::new();
     while filter.limit.is_none_or(|limit| messages < limit) {
         let Some(item) = recording.next_item()? else { break };
         let Item::Message(message) = item else { continue };
+        if !filter.topics.is_empty() && !seen.contains(message.topic()) {
+            seen.insert(message.topic().to_owned());
+        }
         if !filter.takes(&message) {
             continue;
         }
@@ -81,6 +87,12 @@ pub fn cat(path: &Path, filter: &Filter, format: Format, out: &mut impl Write) -
         messages += u64::from(printed);
     }
     out.flush()?;
+    let whole = filter.limit.is_none_or(|limit| messages < limit);
+    let absent = |topic: &&String| !seen.iter().any(|there| matches(std::slice::from_ref(*topic), there));
+    if let Some(topic) = filter.topics.iter().filter(|_| whole).find(absent) {
+        let there = if seen.is_empty() { "none".to_owned() } else { Vec::from_iter(seen).join(", ") };
+        return Err(CatError::NoTopic { path: path.to_owned(), topic: topic.clone(), there });
+    }
     Ok(Printed { messages, end: recording.end().clone() })
 }
 

@@ -1,6 +1,6 @@
 //! What stands in a recording: `dinrail recordings info`.
 
-use crate::disk::human;
+use crate::disk::{Lock, human, open_locked};
 use crate::format::{Gaps, META_CLOCK, META_RECORDING, META_SEALED};
 use crate::reader::{End, Item, Message, ReadError, Recording};
 use crate::utc;
@@ -56,6 +56,8 @@ pub struct Info {
     pub bytes: u64,
     /// Index and end are there.
     pub finished: bool,
+    /// A recorder writes it now, or it is just being made whole.
+    pub being_written: bool,
     pub end: End,
     /// Name of the stack, build, host and so on, as recorded.
     pub recording: BTreeMap<String, String>,
@@ -118,6 +120,7 @@ pub fn info(path: &Path) -> Result<Info, ReadError> {
         path: path.to_owned(),
         bytes: recording.len(),
         finished: false,
+        being_written: matches!(open_locked(path), Ok((_, Lock::InUse))),
         end: End::default(),
         recording: BTreeMap::new(),
         sealed: None,
@@ -295,6 +298,9 @@ impl Info {
         }
         if self.finished {
             return format!("finished, but {} damaged parts are left out", self.end.damaged);
+        }
+        if self.being_written {
+            return "being written".to_owned();
         }
         let (at, unread) = (self.end.offset, self.end.unread);
         format!(

@@ -12,6 +12,7 @@ pub mod character;
 pub mod config;
 pub mod device;
 pub mod dialog;
+mod doubt;
 pub mod driver;
 pub mod list;
 pub mod port;

@@ -128,6 +128,30 @@ pub fn holders(device: &Path) -> Vec<Holder> {
     found
 }
 
+/// [`holders`] but for who made the pseudo-terminal and has its other end: a program such as socat keeps both ends open
+/// and reads its own one only.
+pub fn users(device: &Path) -> Vec<Holder> {
+    let mut users = holders(device);
+    let number = device.strip_prefix("/dev/pts").ok().and_then(|n| n.to_str()?.parse::<u32>().ok());
+    if let Some(number) = number {
+        users.retain(|holder| !has_other_end(holder.pid, number));
+    }
+    users
+}
+
+/// Whether a process has the master of a pseudo-terminal open, which the kernel tells in its `fdinfo` (Linux 5.16).
+fn has_other_end(pid: u32, number: u32) -> bool {
+    let Ok(descriptors) = fs::read_dir(format!("/proc/{pid}/fdinfo")) else { return false };
+    descriptors
+        .flatten()
+        .any(|d| fs::read_to_string(d.path()).is_ok_and(|info| tty_index(&info) == Some(number)))
+}
+
+/// `tty-index:	3` of an `fdinfo`.
+fn tty_index(info: &str) -> Option<u32> {
+    info.lines().find_map(|line| line.strip_prefix("tty-index:")?.trim().parse().ok())
+}
+
 /// Who has locked the device (`flock`), so that nobody else may lock it `alone` or, if not, with others. Unlike
 /// [`holders`] it sees the processes of all users.
 pub fn lock_holder(device: &fs::Metadata, alone: bool) -> Option<Holder> {
@@ -254,6 +278,24 @@ mod tests {
             (None, said("FT232R USB UART"), said("A50285BI"))
         );
         assert_eq!(usb_of(SerialPortType::PciPort), None);
+    }
+
+    #[test]
+    fn who_made_a_pseudo_terminal_is_no_other_user_of_it() {
+        use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+        assert_eq!(tty_index("pos:\t0\nflags:\t02\ntty-index:\t17\n"), Some(17));
+        assert_eq!(tty_index("pos:\t0\nino:\t3\n"), None);
+        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
+        grantpt(&master).unwrap();
+        unlockpt(&master).unwrap();
+        let name = ptsname(&master, Vec::new()).unwrap().to_string_lossy().into_owned();
+        let slave = fs::File::open(&name).unwrap();
+        let me = |list: Vec<Holder>| list.iter().any(|h| h.pid == std::process::id());
+        assert!(me(holders(Path::new(&name))));
+        // Older kernels do not tell who has the master.
+        let told = has_other_end(std::process::id(), name.rsplit('/').next().unwrap().parse().unwrap());
+        assert_eq!(me(users(Path::new(&name))), !told);
+        drop(slave);
     }
 
     #[test]

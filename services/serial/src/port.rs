@@ -425,7 +425,7 @@ fn device(path: &Path, options: &Options) -> Result<Port, PortError> {
     let whole = device.path().to_owned();
     let mut port = Port::plain(Wire::Device(device), kind, whole.display().to_string());
     if options.exclusive
-        && let Some(holder) = list::holders(&whole).into_iter().find(|h| h.pid != std::process::id())
+        && let Some(holder) = list::users(&whole).into_iter().find(|h| h.pid != std::process::id())
     {
         port.notes.push(format!("{shown} is also open in {holder}: it may take bytes away"));
     }

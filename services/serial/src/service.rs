@@ -20,6 +20,7 @@ use serde::Serialize;
 use thiserror::Error;
 
 use crate::config::Config;
+use crate::doubt::{Doubt, Verdict};
 use crate::driver::{Counters, Driver, Sink, echo_flags};
 use crate::port::{Kind, Options, Port, PortError};
 use crate::protocol::sender::Head;
@@ -196,6 +197,9 @@ struct Status<'a> {
     /// Why it is not open.
     #[serde(skip_serializing_if = "Option::is_none")]
     why: Option<&'a str>,
+    /// Nothing that comes is right.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    doubt: Option<&'a str>,
     notes: &'a [String],
     /// Nobody has the other end of the pseudo-terminal open.
     nobody: bool,
@@ -229,6 +233,8 @@ struct Service {
     before: Counters,
     tx_invalid: u64,
     why: Option<String>,
+    doubt: Doubt,
+    doubted: Option<String>,
     notes: Vec<String>,
     realtime: bool,
     answered: bool,
@@ -261,6 +267,8 @@ impl Service {
             before: Counters::default(),
             tx_invalid: 0,
             why: None,
+            doubt: Doubt::default(),
+            doubted: None,
             notes: Vec::new(),
             realtime: false,
             answered: false,
@@ -421,6 +429,8 @@ impl Service {
                 self.opened += 1;
                 self.notes = port.notes().to_vec();
                 self.why = None;
+                self.doubted = None;
+                self.doubt.reset(&self.before);
                 let message = format!("port {} is open, {}", self.config.device, self.options.character);
                 let driver = Driver::new(port, &self.config.settings(kind));
                 let visitors = driver.port().visitors();
@@ -476,7 +486,9 @@ impl Service {
         self.line = Line::Closed(now_ns + self.backoff_ns);
         self.backoff_ns = (self.backoff_ns * 2).min(BACKOFF_NS.1);
         let device = &self.config.device;
-        let text = format!("port {device} is gone ({error}): unplugged or hung up; it is opened again");
+        let text = format!(
+            "port {device} is gone ({error}): unplugged or hung up; it will be opened again when it is back"
+        );
         self.ctx.set_state(HealthState::Degraded);
         self.event(Level::Warning, text.clone());
         self.why = Some(text);
@@ -498,7 +510,30 @@ impl Service {
         let busy_ns = self.config.timing().of(bytes.saturating_sub(self.bytes_seen) as usize);
         self.load_permille = (busy_ns / 1_000_000).min(1000) as u32;
         self.bytes_seen = bytes;
+        if matches!(self.line, Line::Open(_)) {
+            self.look(&counters);
+        }
         self.publish_status();
+    }
+
+    /// Tells when nothing that comes is right, and when it is again.
+    fn look(&mut self, counters: &Counters) {
+        use crate::config::Framing::{Ascii, Rtu};
+        let checked = matches!(self.config.framing, Rtu | Ascii);
+        match self.doubt.look(counters, checked, clock::mono_ns()) {
+            Some(Verdict::Wrong(words)) => {
+                let text = format!("port {} ({}): {words}", self.config.device, self.options.character);
+                self.ctx.set_state(HealthState::Degraded);
+                self.event(Level::Warning, text.clone());
+                self.doubted = Some(text);
+            }
+            Some(Verdict::Right) => {
+                self.doubted = None;
+                self.ctx.set_state(HealthState::Ready);
+                self.event(Level::Info, format!("port {}: frames are right again", self.config.device));
+            }
+            None => {}
+        }
     }
 
     fn counters(&self) -> Counters {
@@ -527,6 +562,7 @@ impl Service {
             character: self.options.character.to_string(),
             framing: self.config.framing,
             why: self.why.as_deref(),
+            doubt: self.doubted.as_deref(),
             notes: &self.notes,
             nobody: port.is_some_and(Driver::nobody),
             realtime: self.realtime,

@@ -410,6 +410,7 @@ mod tests {
 
     fn contents(buses: &[&str]) -> Contents {
         Contents {
+            what: "candump log",
             buses: buses.iter().map(|b| ((*b).to_owned(), 1)).collect(),
             order: buses.iter().map(|b| (*b).to_owned()).collect(),
             frames: 10,

@@ -89,7 +89,7 @@ impl Source {
         Ok(Self { path: path.to_owned(), kind })
     }
 
-    /// `candump log`, `ASC file` or `recording`.
+    /// `candump log`, `ASC file` or `recording`; of a log known once a frame was read.
     pub fn what(&self) -> &'static str {
         match &self.kind {
             Kind::Recording { .. } => "recording",
@@ -227,6 +227,8 @@ fn next_recorded(
 /// What a file holds.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Contents {
+    /// See [`Source::what`].
+    pub what: &'static str,
     /// Frames of each bus.
     pub buses: BTreeMap<String, u64>,
     /// Buses in the order of their first frame.
@@ -259,6 +261,7 @@ pub fn contents(path: &Path) -> anyhow::Result<Contents> {
         contents.order.push(logged.bus.clone());
         contents.buses.insert(logged.bus, 1);
     }
+    contents.what = source.what();
     anyhow::ensure!(contents.frames > 0, "{} holds no CAN frame", path.display());
     Ok(contents)
 }

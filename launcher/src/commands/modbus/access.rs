@@ -1,6 +1,6 @@
 //! `dinrail modbus read` and `write`.
 
-use super::points::{Point, decode};
+use super::points::{Point, ValueType, decode};
 use super::target::Master;
 use crate::commands::{println, table};
 use ipc_types::units::Span;
@@ -39,7 +39,7 @@ pub fn read(
                     let at = usize::from(point.at) + i * point.value_type.registers();
                     match value {
                         Some(value) => {
-                            json!({ "name": point.name, "number": number, "table": point.table, "at": at, "value": value, "registers": raw })
+                            json!({ "name": point.name, "number": number, "table": point.table, "at": at, "form": point.form(), "value": value, "registers": raw })
                         }
                         None => json!({ "name": point.name, "number": number, "table": point.table, "at": at, "error": raw }),
                     }
@@ -54,6 +54,7 @@ pub fn read(
                     let mut row = vec![point.number(*i), format!("{} {at}", point.table.name())];
                     row.push(value.as_ref().map_or_else(|| "-".to_owned(), plain));
                     row.push(raw.clone());
+                    row.push(point.form());
                     if points.iter().any(|p| p.name.is_some()) {
                         row.insert(0, point.name.clone().unwrap_or_default());
                     }
@@ -61,9 +62,9 @@ pub fn read(
                 })
                 .collect();
             let head: &[&str] = if points.iter().any(|p| p.name.is_some()) {
-                &["NAME", "NUMBER", "ADDRESS", "VALUE", "REGISTERS"]
+                &["NAME", "NUMBER", "ADDRESS", "VALUE", "REGISTERS", "READ AS"]
             } else {
-                &["NUMBER", "ADDRESS", "VALUE", "REGISTERS"]
+                &["NUMBER", "ADDRESS", "VALUE", "REGISTERS", "READ AS"]
             };
             crate::commands::print(&table(head, &cells));
         }
@@ -124,12 +125,54 @@ pub fn write(
         let job = json!({ "do": "write", "table": point.table, "at": point.at, "values": values, "multiple": multiple });
         let answer = line.ask(&job)?;
         if json {
-            println(&json!({ "number": point.number(0), "answer": answer }).to_string());
+            println(&json!({ "number": point.number(0), "values": point.count, "entries": values.len(), "form": point.form(), "answer": answer }).to_string());
         } else if answer.get("broadcast").is_some() {
             println(&format!("{}: broadcast, nobody confirms it", point.number(0)));
         } else {
-            println(&format!("{}: {} written", point.number(0), point.count));
+            println(&written(point, values.len()));
         }
     }
     Ok(())
+}
+
+/// `40001: 1 value written as float ABCD, 2 registers`.
+fn written(point: &Point, entries: usize) -> String {
+    let number = point.number(0);
+    let (values, entry) = (point.count, if point.table.is_bits() { "coil" } else { "register" });
+    if point.value_type == ValueType::Text {
+        return format!("{number}: text written, {entries} {entry}{}", plural(entries));
+    }
+    let value = format!("{values} value{} written", plural(values.into()));
+    match point.table.is_bits() {
+        true => format!("{number}: {value}"),
+        false => format!("{number}: {value} as {}, {entries} {entry}{}", point.form(), plural(entries)),
+    }
+}
+
+fn plural(count: usize) -> &'static str {
+    if count == 1 { "" } else { "s" }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::commands::modbus::PointArgs;
+    use crate::commands::modbus::points::parse_writes;
+
+    #[test]
+    fn what_was_written_is_counted() {
+        let form = PointArgs { table: None, value_type: None, order: None };
+        let texts =
+            ["40001=5", "40001=1,2", "40001:float=1.5", "00001=on", "00001=on,off", "40001:string=abc"];
+        let writes = parse_writes(&texts.map(str::to_owned), &form).unwrap();
+        let said: Vec<String> = writes.iter().map(|(point, values)| written(point, values.len())).collect();
+        insta::assert_snapshot!(said.join("\n"), @"
+        40001: 1 value written as uint16, 1 register
+        40001: 2 values written as uint16, 2 registers
+        40001: 1 value written as float ABCD, 2 registers
+        00001: 1 value written
+        00001: 2 values written
+        40001: text written, 2 registers
+        ");
+    }
 }

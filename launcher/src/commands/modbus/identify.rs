@@ -51,11 +51,22 @@ pub fn scan(line: &mut Master, from: u8, to: u8, json: bool) -> anyhow::Result<(
         println(&json!({ "asked": count, "found": list }).to_string());
     }
     if found.is_empty() {
-        eprintln!("dinrail: none of {count} units answered. {}", line.why_silent());
-    } else if !json {
-        println(&format!("{} of {count} units answer", found.len()));
+        anyhow::bail!("{}. {}", nobody(from, to), line.why_silent());
+    }
+    if !json {
+        let answer = if found.len() == 1 { "answers" } else { "answer" };
+        println(&format!("{} of {count} unit{} {answer}", found.len(), if count == 1 { "" } else { "s" }));
     }
     Ok(())
+}
+
+/// That no unit answered.
+fn nobody(from: u8, to: u8) -> String {
+    if from == to {
+        format!("unit {from} does not answer")
+    } else {
+        format!("none of the {} units from {from} to {to} answers", u32::from(to - from) + 1)
+    }
 }
 
 /// Asks for all objects of 43/14 and for 17.
@@ -136,4 +147,15 @@ pub fn identify(line: &mut Master, json: bool) -> anyhow::Result<()> {
         Err(text) => println(&format!("server id (17): {text}")),
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nobody_in_words() {
+        assert_eq!(nobody(5, 5), "unit 5 does not answer");
+        assert_eq!(nobody(1, 247), "none of the 247 units from 1 to 247 answers");
+    }
 }

@@ -76,7 +76,8 @@ pub enum ModbusCommand {
     Write {
         #[command(flatten)]
         master: MasterArgs,
-        /// ADDRESS[:TYPE[:ORDER]]=VALUE[,VALUE], e.g. 40001=5, 00001=on, 40010:float=1.5
+        /// ADDRESS[xCOUNT][:TYPE[:ORDER]]=VALUE[,VALUE], e.g. 40001=5, 40001=1,2,3, 00001=on, 40010:float=1.5,
+        /// 40010x2:float=1.5,2.5
         #[arg(required = true, value_name = "POINT=VALUE")]
         points: Vec<String>,
         #[command(flatten)]

@@ -94,6 +94,24 @@ impl Point {
         self.count * self.value_type.registers() as u16
     }
 
+    /// How its registers are read or written: `float ABCD`, or the type alone where there is no order to speak of.
+    pub fn form(&self) -> String {
+        let name = match self.value_type {
+            ValueType::Int(n) => format!("int{}", n * 16),
+            ValueType::Uint(n) => format!("uint{}", n * 16),
+            ValueType::Float(2) => "float".to_owned(),
+            ValueType::Float(_) => "double".to_owned(),
+            ValueType::Bit => "bit".to_owned(),
+            ValueType::Hex => "hex".to_owned(),
+            ValueType::Text => "string".to_owned(),
+        };
+        if self.value_type.registers() > 1 || self.order != Order::default() {
+            format!("{name} {}", self.order.name())
+        } else {
+            name
+        }
+    }
+
     /// The traditional number of a value.
     pub fn number(&self, value: usize) -> String {
         traditional_number(self.table, self.at + (value * self.value_type.registers()) as u16)
@@ -216,6 +234,19 @@ fn parse_write(text: &str, form: &PointArgs) -> Result<(Point, Vec<Value>), Usag
         point.count = out.len() as u16;
         ends_in_table(text, &point, out.len())?;
         return Ok((point, out));
+    }
+    let given = values.split(',').count();
+    let wanted = usize::from(point.count);
+    if given > 1 && wanted == 1 && matches!(point.value_type, ValueType::Float(_)) {
+        let name = place.trim();
+        let (head, tail) = name.split_at(name.find(':').unwrap_or(name.len()));
+        return Err(usage(format!(
+            "'{text}': write {} with a decimal point; {given} values are written by {head}x{given}{tail}={values}",
+            values.replacen(',', ".", 1)
+        )));
+    }
+    if wanted > 1 && wanted != given {
+        return Err(usage(format!("'{text}': {wanted} values are to be written, and {given} given")));
     }
     let mut count = 0;
     for value in values.split(',') {
@@ -389,6 +420,13 @@ mod tests {
     }
 
     #[test]
+    fn the_order_of_values_is_shown() {
+        let shown = ["40001", "40001:float", "40001:uint32:CDAB", "40001:int16:BA", "00001", "40001:double"]
+            .map(|text| parse(text, &form(), 1).unwrap().form());
+        assert_eq!(shown, ["uint16", "float ABCD", "uint32 CDAB", "int16 BA", "bit", "double ABCD"]);
+    }
+
+    #[test]
     fn values_there_and_back() {
         for (text, words, value) in [
             ("40001=5", vec![5], json!(5)),
@@ -430,6 +468,9 @@ mod tests {
             &long,
             "465536=1,2",
             "465536:string=abc",
+            "40001:float=1,5",
+            "40001:double:CDAB=-1,5",
+            "40001x3=1,2",
         ];
         let wrong: Vec<String> = texts.iter().map(|text| parse_write(text, &form()).unwrap_err().0).collect();
         insta::assert_snapshot!(wrong.join("\n").replace(&"x".repeat(247), "..."), @r#"
@@ -445,6 +486,13 @@ mod tests {
         '40001:string=...': one request writes 1 to 246 characters
         '465536=1,2': reaches behind address 65535
         '465536:string=abc': reaches behind address 65535
+        '40001:float=1,5': write 1.5 with a decimal point; 2 values are written by 40001x2:float=1,5
+        '40001:double:CDAB=-1,5': write -1.5 with a decimal point; 2 values are written by 40001x2:double:CDAB=-1,5
+        '40001x3=1,2': 3 values are to be written, and 2 given
         "#);
+        let (point, written) = parse_write("40001x2:float=1,5", &form()).unwrap();
+        assert_eq!((point.count, written.len()), (2, 4));
+        let (point, written) = parse_write("40001=1,2,3", &form()).unwrap();
+        assert_eq!((point.count, written.len()), (3, 3));
     }
 }

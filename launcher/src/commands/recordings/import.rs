@@ -63,7 +63,7 @@ fn write(
     log: &Path,
 ) -> anyhow::Result<u64> {
     let mut out = RecordingFile::new(Arc::new(file), Compression::Zstd, true)?;
-    out.metadata(META_RECORDING, about(log, source.what(), contents))?;
+    out.metadata(META_RECORDING, about(log, contents))?;
     // A log has one clock: its stamps are taken for both.
     out.metadata(META_CLOCK, clock_metadata(0, contents.first_ns, "imported"))?;
     let mut ports: BTreeMap<&str, (u16, u32, u64)> = BTreeMap::new();
@@ -104,12 +104,12 @@ fn write(
 }
 
 /// A log of which no frame tells its direction makes a recording that does not, either.
-fn about(log: &Path, what: &str, contents: &Contents) -> BTreeMap<String, String> {
+fn about(log: &Path, contents: &Contents) -> BTreeMap<String, String> {
     let name = log.file_name().map(|name| name.to_string_lossy().into_owned());
     let mut about = BTreeMap::from([
         ("stack".to_owned(), "import".to_owned()),
         ("imported_from".to_owned(), name.unwrap_or_default()),
-        ("imported_as".to_owned(), what.to_owned()),
+        ("imported_as".to_owned(), contents.what.to_owned()),
         ("version".to_owned(), env!("CARGO_PKG_VERSION").to_owned()),
         ("host".to_owned(), host_name()),
     ]);

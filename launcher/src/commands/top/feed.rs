@@ -257,3 +257,40 @@ fn shoot(plc: &Plc, image: &Image, tail: &[u8]) -> Option<Shot> {
         areas: areas.map(|(area, bytes)| (area.letter(), used(bytes))).into(),
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ipc_types::wiring::OnBad;
+
+    #[test]
+    fn points_are_named_as_the_stack_file_names_them() {
+        let range = |area, byte, bit, bytes, type_name: &str| ImageRange {
+            area,
+            byte,
+            bit,
+            bytes,
+            type_name: Some(type_name.to_owned()),
+            symbol: None,
+            label: String::new(),
+            key: String::new(),
+            on_bad: OnBad::default(),
+            status_byte: None,
+        };
+        let ranges = [
+            range(Area::Input, 4, None, 4, "DINT"),
+            range(Area::Input, 2, None, 2, "UINT"),
+            range(Area::Input, 1, None, 2, "UINT"),
+            range(Area::Input, 0, Some(3), 1, "BOOL"),
+        ];
+        let image = Image { input_bytes: 8, n: 8, ..Image::default() };
+        let shown = |addressing| {
+            let points = ranges.iter().map(|r| ("io".to_owned(), r.clone())).collect();
+            let plc = Plc { name: "plc".to_owned(), addressing, points };
+            let shot = shoot(&plc, &image, &[8, 0, 7, 0, 0xFE, 0xFF, 0xFF, 0xFF]).unwrap();
+            shot.points.iter().map(|p| format!("{} {}", p.address, p.value)).collect::<Vec<_>>().join(", ")
+        };
+        assert_eq!(shown(Addressing::Element), "%ID1 -2, %IW1 7, %IB1 1792, %IX0.3 TRUE");
+        assert_eq!(shown(Addressing::Byte), "%ID4 -2, %IW2 7, %IW1 1792, %IX0.3 TRUE");
+    }
+}

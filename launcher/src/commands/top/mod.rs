@@ -24,6 +24,7 @@ use model::{Key, Model, View, Wish};
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 use std::io::IsTerminal;
+use std::mem::ManuallyDrop;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant};
 
@@ -50,15 +51,18 @@ pub fn run(stack: Option<&str>, every: Duration) -> anyhow::Result<()> {
     // Sets a panic hook that restores the terminal first.
     let terminal = ratatui::try_init().context("preparing the terminal")?;
     let (done, results) = channel();
+    let terminal = ManuallyDrop::new(terminal);
     let mut screen = Screen { terminal, model, feed: Some(feed), stack, every, done, results };
     let ended = screen.work(&guard);
+    let _ = screen.terminal.show_cursor();
     let restored = ratatui::try_restore().context("restoring the terminal");
     // What fails on a terminal that is gone is nobody's error.
     if guard.asked() { Ok(()) } else { ended.and(restored) }
 }
 
 struct Screen {
-    terminal: DefaultTerminal,
+    /// Its own end panics when neither the terminal nor stderr is there any more.
+    terminal: ManuallyDrop<DefaultTerminal>,
     model: Model,
     /// `None` while the stack is down.
     feed: Option<Feed>,

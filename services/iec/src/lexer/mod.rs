@@ -253,6 +253,9 @@ fn flush_bad(bad: &mut Option<Span>, text: &str, problems: &mut Vec<Diagnostic>)
         '\'' | '"' => "the text is not closed on its line",
         '{' => "the pragma is never closed with `}`",
         '%' => "an address is written like %IX0.3 or %QW2",
+        '!' if text[span.start as usize..].starts_with("!=") => "\"not equal\" is written `<>`",
+        '!' | '~' => "\"not\" is written NOT",
+        '|' => "\"or\" is written OR",
         c if !c.is_ascii() => "outside comments and texts only ASCII is allowed",
         _ => "remove it",
     };

@@ -196,8 +196,33 @@ impl Parser<'_> {
         let found = self.describe_current();
         let d = Diagnostic::new("E0201", self.span(), format!("expected {what}, found {found}"))
             .label(format!("expected {what}"));
+        let d = match self.habit() {
+            Some(help) => d.help(help),
+            None => d,
+        };
         self.report(d);
         Err(Skip)
+    }
+
+    /// How what other languages write here is written in this one.
+    fn habit(&self) -> Option<&'static str> {
+        let sum = |k| matches!(k, TokenKind::Plus | TokenKind::Minus | TokenKind::Star | TokenKind::Slash);
+        if sum(self.kind()) && self.peek(1) == TokenKind::Eq {
+            return Some("write the whole assignment: `x := x + 1`");
+        }
+        let adjacent = self.last_span().end == self.token().start;
+        let before = self.at.checked_sub(1).map(|i| self.tokens[i].kind);
+        match (before, self.kind()) {
+            (Some(TokenKind::Eq), TokenKind::Eq) if adjacent => Some("\"equal\" is written `=`"),
+            (Some(TokenKind::Amp), TokenKind::Amp) if adjacent => Some("\"and\" is written AND or `&`"),
+            (_, TokenKind::Eq) if !matches!(before, Some(TokenKind::Assign)) => Some("an assignment is written `:=`"),
+            (Some(TokenKind::Word(None)), _) => {
+                let last = self.last_span();
+                let word = self.text.get(last.start as usize..last.end as usize).unwrap_or("");
+                ["ELSEIF", "ELIF"].iter().any(|w| word.eq_ignore_ascii_case(w)).then_some("it is written ELSIF")
+            }
+            _ => None,
+        }
     }
 
     fn expect(&mut self, k: TokenKind) -> Parsed<Token> {

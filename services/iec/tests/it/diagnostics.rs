@@ -172,3 +172,22 @@ fn very_long_lines_are_not_shown() {
     );
     assert!(rendered.len() < 100 * 200, "{}", rendered.len());
 }
+
+#[test]
+fn habits_of_other_languages_get_the_spelling_of_this_one() {
+    let cases = [
+        ("IF x != 1 THEN x := 2; END_IF", "written `<>`"),
+        ("IF !b THEN x := 2; END_IF", "written NOT"),
+        ("b := b | b;", "written OR"),
+        ("IF x == 1 THEN x := 2; END_IF", "written `=`"),
+        ("IF b && b THEN x := 2; END_IF", "written AND"),
+        ("x += 1;", "x := x + 1"),
+        ("x = 5;", "written `:=`"),
+        ("IF b THEN x := 1; ELSEIF NOT b THEN x := 2; END_IF", "written ELSIF"),
+    ];
+    for (line, help) in cases {
+        let text = format!("PROGRAM p VAR x : INT; b : BOOL; END_VAR\n{line}\nEND_PROGRAM");
+        let said = compile(&source(&text), &Options::default()).unwrap_err().render(false);
+        assert!(said.contains(help), "{line}\n{said}");
+    }
+}

@@ -25,7 +25,7 @@ mod unit;
 
 use types::Pdu;
 pub use types::{
-    Failure, LineCounters, Origin, QueueFull, Settings, SlotKind, Step, UnitCounters, UnitSettings,
+    Failure, LineCounters, Origin, QueueFull, Settings, SlotKind, Step, UnitCounters, UnitNews, UnitSettings,
     UnitState, UnitView,
 };
 use unit::Unit;
@@ -248,8 +248,8 @@ impl Line {
         })
     }
 
-    /// A unit that has gone dead (`true`) or has come back since it was last told of; to be called until `None`.
-    pub fn unit_news(&mut self) -> Option<(u8, bool)> {
+    /// A unit that has gone dead or come back since it was last told of; to be called until `None`.
+    pub fn unit_news(&mut self) -> Option<UnitNews> {
         if !self.news {
             return None;
         }
@@ -257,7 +257,8 @@ impl Line {
             let dead = unit.state == UnitState::Dead;
             if unit.told_dead != dead {
                 unit.told_dead = dead;
-                return Some((unit.number, dead));
+                let by_gateway = unit.last_exception.filter(|_| unit.by_gateway).map(|(code, _)| code);
+                return Some(UnitNews { unit: unit.number, dead, by_gateway });
             }
         }
         self.news = false;

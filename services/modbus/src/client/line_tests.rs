@@ -65,7 +65,7 @@ fn a_read_and_its_period() {
     line.answer(5, &[0x83, 2], 52 * MS);
     assert_eq!(steps(&mut line, 52 * MS), ["done Slot(0) [83, 02]", "wait 100"]);
     let view = line.units().next().unwrap();
-    assert_eq!((view.state, view.counters.exceptions, view.last_exception), (UnitState::Ok, 1, Some(2)));
+    assert_eq!((view.state, view.counters.exceptions, view.last_exception), (UnitState::Ok, 1, Some((2, 3))));
 }
 
 #[test]
@@ -275,33 +275,120 @@ fn what_a_gateway_says_of_a_unit_is_no_answer_of_the_unit() {
         let write = line.add_slot(1, SlotKind::Write, &[], None);
         line.set_write(write, &[6, 0, 0, 0, 1], 0);
         steps(&mut line, 0);
-        line.sent(0);
-        line.answer(1, &[0x86, code], 50 * MS);
-        // The connection stays, nothing is repeated at once, and the write is kept.
-        assert_eq!(steps(&mut line, 50 * MS), ["failed Slot(1) NoAnswer", "wait 1050"]);
+        for at_ms in [0, 50] {
+            line.sent(at_ms * MS);
+            let end_ns = (at_ms + 50) * MS;
+            line.answer(1, &[0x86, code], end_ns);
+            // The connection stays, nothing is repeated but the write, which is kept.
+            let said = steps(&mut line, end_ns);
+            assert_eq!(said[..2], ["failed Slot(1) NoAnswer", "send 1 [06, 00, 00, 00, 01]"]);
+            assert_eq!((line.unit_state(1), line.unit_news()), (UnitState::Failing, None));
+        }
+        line.sent(100 * MS);
+        line.answer(1, &[0x86, code], 150 * MS);
+        assert_eq!(steps(&mut line, 150 * MS), ["failed Slot(1) NoAnswer", "wait 1150"]);
+        let news = UnitNews { unit: 1, dead: true, by_gateway: Some(code) };
+        assert_eq!((line.unit_news(), line.unit_news()), (Some(news), None));
         let view = line.units().next().unwrap();
         assert_eq!(
             (view.state, view.counters.timeouts, view.last_exception),
-            (UnitState::Dead, 0, Some(code))
+            (UnitState::Dead, 0, Some((code, 6)))
         );
         // A job gets the exception as it is, and changes nothing about the unit.
         line.push_job(1, 1, &read(0, 1), u64::MAX, false).unwrap();
-        steps(&mut line, 60 * MS);
-        line.sent(60 * MS);
-        line.answer(1, &[0x83, code], 70 * MS);
+        steps(&mut line, 160 * MS);
+        line.sent(160 * MS);
+        line.answer(1, &[0x83, code], 170 * MS);
         assert_eq!(
-            steps(&mut line, 70 * MS),
-            [format!("done Job(1) [83, {code:02X}]"), "wait 1050".to_owned()]
+            steps(&mut line, 170 * MS),
+            [format!("done Job(1) [83, {code:02X}]"), "wait 1150".to_owned()]
         );
         assert_eq!(line.unit_state(1), UnitState::Dead);
-        assert_eq!(steps(&mut line, 1050 * MS)[0], "send 1 [06, 00, 00, 00, 01]");
-        line.sent(1050 * MS);
-        line.answer(1, &[6, 0, 0, 0, 1], 1060 * MS);
+        assert_eq!(steps(&mut line, 1150 * MS)[0], "send 1 [06, 00, 00, 00, 01]");
+        line.sent(1150 * MS);
+        line.answer(1, &[6, 0, 0, 0, 1], 1160 * MS);
         assert_eq!(
-            steps(&mut line, 1060 * MS)[..2],
+            steps(&mut line, 1160 * MS)[..2],
             ["done Slot(1) [06, 00, 00, 00, 01]", "send 1 [03, 00, 00, 00, 01]"]
         );
+        let back = UnitNews { unit: 1, dead: false, by_gateway: None };
+        assert_eq!((line.unit_news().map(|n| n.dead), line.unit_news()), (Some(back.dead), None));
     }
+}
+
+#[test]
+fn lost_answers_cost_their_own_time_until_they_are_three_in_a_row() {
+    let mut line = Line::new(SERIAL, unit(100, 0));
+    // Another unit is well, so that a dead one is left alone for 25 times its cost.
+    line.add_slot(1, SlotKind::Read, &read(0, 1), Some(3_600_000 * MS));
+    steps(&mut line, 0);
+    line.sent(0);
+    line.answer(1, &[3, 2, 0, 0], 0);
+    steps(&mut line, 0);
+    let mut now_ns = 0;
+    let mut ask = |line: &mut Line, id: u64, answered: bool| {
+        line.push_job(id, 2, &read(0, 1), u64::MAX, true).unwrap();
+        let said = steps(line, now_ns).remove(0);
+        if !said.starts_with("send") {
+            return said;
+        }
+        line.sent(now_ns);
+        if answered {
+            line.answer(2, &[3, 2, 0, 0], now_ns + MS);
+        }
+        let said = steps(line, now_ns + 100 * MS).remove(0);
+        // Behind everything that may come late.
+        now_ns += 1000 * MS;
+        said
+    };
+    for (id, answered) in [(1, true), (2, false), (3, false), (4, true), (5, false), (6, false)] {
+        let said = ask(&mut line, id, answered);
+        assert_eq!(said.starts_with("done"), answered, "{said}");
+        assert_eq!(line.unit_news(), None);
+    }
+    assert!(ask(&mut line, 7, false).ends_with("NoAnswer"));
+    assert_eq!(line.unit_news(), Some(UnitNews { unit: 2, dead: true, by_gateway: None }));
+    assert!(ask(&mut line, 8, true).ends_with("UnitDown"));
+    assert_eq!(line.unit_news(), None);
+}
+
+#[test]
+fn periods_begin_with_the_first_turn_not_with_the_machine() {
+    let up_ns = 400_000_000 * MS;
+    let mut line = Line::new(TCP, unit(100, 0));
+    line.add_slot(1, SlotKind::Read, &read(0, 1), Some(1000 * MS));
+    line.add_slot(1, SlotKind::Read, &read(9, 1), Some(1000 * MS));
+    let mut now_ns = up_ns;
+    while now_ns < up_ns + 3_500 * MS {
+        match line.step(now_ns) {
+            Step::Send { unit, pdu, .. } => {
+                let answer = answer_to(pdu);
+                line.sent(now_ns);
+                line.answer(unit, &answer, now_ns + MS);
+            }
+            Step::Wait(until) => now_ns = until.unwrap(),
+            _ => {}
+        }
+    }
+    assert_eq!((line.counters().missed_periods, line.units().next().unwrap().counters.answers), (0, 8));
+}
+
+#[test]
+fn units_of_a_broken_link_have_no_connection() {
+    let mut line = Line::new(TCP, unit(100, 0));
+    line.add_slot(1, SlotKind::Read, &read(0, 1), Some(0));
+    let state = |line: &Line| line.units().next().unwrap().state;
+    assert_eq!(state(&line), UnitState::Unknown);
+    steps(&mut line, 0);
+    line.link_failed(MS);
+    assert_eq!((state(&line), line.is_link_down()), (UnitState::NoConnection, true));
+    assert_eq!(serde_json::to_value(state(&line)).unwrap(), "no connection");
+    steps(&mut line, MS);
+    steps(&mut line, 101 * MS);
+    line.sent(101 * MS);
+    assert_eq!(state(&line), UnitState::Unknown);
+    line.answer(1, &[3, 2, 0, 0], 102 * MS);
+    assert_eq!((state(&line), line.is_link_down()), (UnitState::Ok, false));
 }
 
 #[test]
@@ -354,15 +441,17 @@ fn jobs_of_a_gateway_fail_fast_at_a_dead_unit() {
     };
     assert!(ask(&mut line, 1, 1, 0)[0].starts_with("send"));
     assert!(steps(&mut line, MS)[0].starts_with("done"));
-    assert!(ask(&mut line, 2, 2, 10 * MS)[0].starts_with("send"));
-    assert!(steps(&mut line, 110 * MS)[0].ends_with("NoAnswer"));
-    // 100 ms lost, so 25 times as long nobody waits for it again.
-    assert_eq!(ask(&mut line, 3, 2, 111 * MS)[0], "failed Job(3) UnitDown");
-    assert_eq!(ask(&mut line, 4, 2, 2609 * MS)[0], "failed Job(4) UnitDown");
-    assert!(ask(&mut line, 5, 2, 2610 * MS)[0].starts_with("send"));
-    line.answer(2, &[3, 2, 0, 0], 2620 * MS);
-    assert!(steps(&mut line, 2620 * MS)[0].starts_with("done"));
-    assert!(ask(&mut line, 6, 2, 2621 * MS)[0].starts_with("send"));
+    for (id, at_ms) in [(2, 10), (3, 110), (4, 210)] {
+        assert!(ask(&mut line, id, 2, at_ms * MS)[0].starts_with("send"));
+        assert!(steps(&mut line, (at_ms + 100) * MS)[0].ends_with("NoAnswer"));
+    }
+    // 100 ms lost by the last one, so 25 times as long nobody waits for it again.
+    assert_eq!(ask(&mut line, 5, 2, 311 * MS)[0], "failed Job(5) UnitDown");
+    assert_eq!(ask(&mut line, 6, 2, 2809 * MS)[0], "failed Job(6) UnitDown");
+    assert!(ask(&mut line, 7, 2, 2810 * MS)[0].starts_with("send"));
+    line.answer(2, &[3, 2, 0, 0], 2820 * MS);
+    assert!(steps(&mut line, 2820 * MS)[0].starts_with("done"));
+    assert!(ask(&mut line, 8, 2, 2821 * MS)[0].starts_with("send"));
 }
 
 /// Answers per unit after `span_ns` on a line where a request takes `wire_ns`, and `dead` never answers; or a gateway
@@ -455,8 +544,8 @@ fn a_unit_that_comes_back_is_polled_again_at_its_period() {
         }
     }
     let first = answers.iter().find(|(unit, _)| *unit == 2).unwrap().1;
-    // Failed at 210 ms after 2 tries: 25 x 200 ms later at the latest.
-    assert!(first < 5_400 * MS, "{first}");
+    // Dead after four tries at 450 ms, tried again 25 x 100 ms later and once more.
+    assert!(first < 6_000 * MS, "{first}");
     let since = answers.iter().filter(|(unit, _)| *unit == 2).count() as u64;
     assert!(since >= (60_000 * MS - first) / (100 * MS) - 1, "{since}");
 }

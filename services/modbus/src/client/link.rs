@@ -224,9 +224,10 @@ impl Task {
                     self.tell(Report::Answer { unit, pdu });
                 }
                 Err(e) => {
+                    let why = in_words(&e, connection.as_ref().map_or(Idle::Well, |(_, fd)| idle(fd)));
                     connection = None;
                     self.ended |= matches!(e, tokio_modbus::Error::Transport(_));
-                    self.tell(Report::Failed(format!("{address}: {}", in_words(&e))));
+                    self.tell(Report::Failed(format!("{address}: {why}")));
                 }
             }
         }
@@ -296,7 +297,7 @@ impl Task {
                 }
             };
             match read {
-                Ok(0) => return Err(Some(std::io::Error::other("the server closed the connection"))),
+                Ok(0) => return Err(Some(std::io::Error::other(CLOSED))),
                 Ok(n) => buffer.extend_from_slice(&some[..n]),
                 Err(e) => return Err(Some(e)),
             }
@@ -393,11 +394,22 @@ fn response_pdu(response: &Response) -> Vec<u8> {
     pdu
 }
 
-/// What went wrong, for people; tokio-modbus' own texts carry whole frames.
-fn in_words(error: &tokio_modbus::Error) -> String {
+const CLOSED: &str = "the other side closed the connection";
+
+/// What went wrong, for people; tokio-modbus' own texts carry whole frames. At the end of a connection it makes an
+/// error of whatever the system's last one was (EAGAIN most of the time), so the connection itself is asked.
+fn in_words(error: &tokio_modbus::Error, connection: Idle) -> String {
+    use std::io::ErrorKind::{BrokenPipe, ConnectionReset, UnexpectedEof, WouldBlock};
     match error {
-        tokio_modbus::Error::Transport(e) if e.raw_os_error() == Some(0) => {
-            "the server closed the connection".to_owned()
+        tokio_modbus::Error::Transport(e) if e.kind() == ConnectionReset => {
+            "the other side broke the connection off".to_owned()
+        }
+        tokio_modbus::Error::Transport(e)
+            if connection == Idle::Ended
+                || e.raw_os_error() == Some(0)
+                || matches!(e.kind(), BrokenPipe | UnexpectedEof | WouldBlock) =>
+        {
+            CLOSED.to_owned()
         }
         tokio_modbus::Error::Transport(e) => e.to_string(),
         tokio_modbus::Error::Protocol(_) => "the answer belongs to another request".to_owned(),

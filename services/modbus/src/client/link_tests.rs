@@ -147,3 +147,35 @@ fn an_order_that_comes_while_another_is_under_way_is_not_lost() {
         assert_eq!(told[..2], [Report::Connected { anew: false }, Report::Sent], "RTU: {over_rtu}");
     }
 }
+
+#[test]
+fn the_end_of_a_connection_is_called_so_whatever_the_error_says() {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    for over_rtu in [false, true] {
+        let test = async {
+            let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+            let address = listener.local_addr().unwrap();
+            let target = if over_rtu { Target::RtuOverTcp(address) } else { Target::Tcp(address) };
+            tokio::task::spawn_local(async move {
+                let (mut stream, _) = listener.accept().await.unwrap();
+                stream.read(&mut [0; 64]).await.unwrap();
+            });
+            let (reports_in, mut reports) = mpsc::unbounded_channel();
+            let mut link = Link::start(0, &target, Duration::from_secs(20), reports_in).unwrap();
+            link.send(5, &[3, 0, 0, 0, 1]);
+            loop {
+                if let (_, _, Report::Failed(why)) = reports.recv().await.unwrap() {
+                    return (why, address);
+                }
+            }
+        };
+        let (why, address) = tokio::task::LocalSet::new()
+            .block_on(&runtime, async { tokio::time::timeout(Duration::from_secs(30), test).await })
+            .expect("the test hangs");
+        assert_eq!(why, format!("{address}: the other side closed the connection"), "RTU: {over_rtu}");
+    }
+    let stale = tokio_modbus::Error::Transport(std::io::Error::from_raw_os_error(11));
+    assert_eq!(in_words(&stale, Idle::Well), CLOSED);
+    let reset = tokio_modbus::Error::Transport(std::io::Error::from_raw_os_error(104));
+    assert_eq!(in_words(&reset, Idle::Ended), "the other side broke the connection off");
+}

@@ -113,6 +113,10 @@ fn mistakes_are_named() {
     };
     let all = [
         said(json!({})),
+        // Nothing but the cause is told.
+        said(json!({ "unit": [{ "id": 3, "name": "main" }],
+                     "read": [{ "unit": "main", "table": "input", "at": 0, "to": "%IW0" },
+                              { "unit": 7, "table": "input", "at": 1, "to": "%IW1" }] })),
         said(json!({ "serial": "com1", "tcp": "10.0.0.1:502" })),
         said(json!({ "serial": "com1", "mode": "tcp" })),
         said(json!({ "tcp": "10.0.0.1:502", "mode": "ascii" })),
@@ -150,6 +154,8 @@ fn mistakes_are_named() {
     ];
     insta::assert_snapshot!(all.join("\n"), @r#"
     : the service has no line: neither serial nor tcp -> add serial = "NAME", or tcp = "ADDRESS:502"
+    : the service has no line: neither serial nor tcp -> add serial = "NAME", or tcp = "ADDRESS:502"
+    unit[0]: unit 3 has no line -> give it tcp = "ADDRESS:502", or give the service a line
     tcp: the service has a serial line and a connection -> remove serial or tcp
     mode: mode "tcp" is for connections -> use "rtu" or "ascii" on a serial line
     mode: mode "ascii" is for serial lines -> use "tcp", or "rtu" for a converter that passes RTU frames on

@@ -10,7 +10,7 @@ mod runner;
 mod status;
 
 use self::jobs::Asker;
-use self::runner::{Runner, Transport, Use, batch_done, runner};
+use self::runner::{Place, Runner, Transport, Use, batch_done, exception_of, runner};
 use super::alarm::Alarm;
 use super::config::{Config, MAX_READS};
 use super::image::{InputTable, WriteTable};
@@ -21,10 +21,10 @@ use super::port::Incoming;
 use super::wiring::plc_of;
 pub use crate::process::RunError;
 use crate::process::{Wake, Wakes, run_here};
-use ipc_types::event::{Budget, EventKind, Level};
+use ipc_types::event::Budget;
 use ipc_types::inputs::InputsPort;
 use ipc_types::outputs::{Guard, OutputImage};
-use ipc_types::payload::{Inputs, Job, JobResult};
+use ipc_types::payload::{HealthState, Inputs, Job, JobResult, Quality};
 use ipc_types::port::{Publisher, Subscriber};
 use ipc_types::topic::TopicKind;
 use ipc_types::turns::STATUS_BEATS;
@@ -45,6 +45,9 @@ struct Service {
     reads: Vec<String>,
     /// Line and unit of each read.
     read_units: Vec<(usize, u8)>,
+    /// What was last told of the quality of each read.
+    told: Vec<Quality>,
+    state: HealthState,
     runners: Vec<Runner>,
     inputs: InputTable,
     writes: WriteTable,
@@ -115,6 +118,7 @@ impl Service {
             let runner = &mut runners[write.line];
             write_slots.push((write.line, runner.line.add_slot(write.unit, SlotKind::Write, &[], None)));
             runner.uses.push(Use::Write);
+            runner.places.push(Place::new(write.table, write.at, write.count));
         }
         let image = match (&wiring.plc, writes.is_empty()) {
             (Some(plc), false) => Some(ctx.subscriber(&TopicKind::Image.of(plc))?),
@@ -131,6 +135,7 @@ impl Service {
             read.symbol.clone().unwrap_or_else(|| read.to.clone())
         });
         let labels: Vec<String> = labels.take(MAX_READS).collect();
+        let told = vec![Quality::NoData; labels.len()];
         let read_units = reads.iter().map(|read| (read.line, read.unit)).collect();
         let (inputs, writes) = (InputTable::new(&reads), WriteTable::new(&writes));
         Ok(Self {
@@ -138,6 +143,8 @@ impl Service {
             config,
             reads: labels,
             read_units,
+            told,
+            state: HealthState::Ready,
             runners,
             inputs,
             writes,
@@ -182,21 +189,29 @@ impl Service {
     /// Frames of serial lines; true when more wait.
     fn take_serial(&mut self) -> bool {
         let mut more = false;
-        for runner in &mut self.runners {
+        for i in 0..self.runners.len() {
+            let runner = &mut self.runners[i];
             let Transport::Serial(port) = &mut runner.transport else { continue };
-            let (line, trouble) = (&mut runner.line, &mut runner.trouble);
+            let line = &mut runner.line;
+            // Whether the last request has left.
+            let mut left = None;
             more |= !port.drain(|incoming| match incoming {
                 Incoming::Sent { t_ns } => {
-                    *trouble = None;
+                    left = Some(true);
                     line.sent(t_ns);
                 }
                 Incoming::NotSent => {
-                    *trouble = Some("the serial port does not work; see its status".to_owned());
+                    left = Some(false);
                     line.link_failed(clock::mono_ns());
                 }
                 Incoming::Frame { unit, pdu, t_ns } => line.answer(unit, pdu, t_ns),
                 Incoming::Garbage => line.garbage(),
             });
+            match left {
+                Some(true) => self.link_works(i),
+                Some(false) => self.link_trouble(i, "the serial port does not work; see its status"),
+                None => {}
+            }
         }
         more
     }
@@ -212,10 +227,7 @@ impl Service {
         match report {
             Report::Connected { anew } => {
                 runner.connected = true;
-                if runner.trouble.take().is_some() {
-                    let message = format!("connected to {} again", runner.plan.target);
-                    self.tell(EventKind::BusState, Level::Info, message);
-                }
+                self.link_works(line);
                 self.runners[line].rewrite.wanted |= anew;
                 self.rewrite(line, now_ns);
             }
@@ -225,9 +237,7 @@ impl Service {
             Report::Failed(why) => {
                 runner.connected = false;
                 runner.line.link_failed(now_ns);
-                if runner.trouble.replace(why.clone()).is_none() {
-                    self.tell(EventKind::BusState, Level::Warning, why);
-                }
+                self.link_trouble(line, &why);
             }
         }
     }
@@ -236,8 +246,7 @@ impl Service {
     fn pump(&mut self, line: usize) -> Option<u64> {
         loop {
             let now_ns = clock::mono_ns();
-            let Runner { line: core, transport, uses, plan, trouble, connected, .. } =
-                &mut self.runners[line];
+            let Runner { line: core, transport, uses, plan, connected, .. } = &mut self.runners[line];
             match core.step(now_ns) {
                 Step::Wait(until) => return until,
                 Step::Reset => {
@@ -250,28 +259,31 @@ impl Service {
                     Transport::Tcp(link) => link.send(unit, pdu),
                     Transport::Serial(port) => {
                         if let Err(e) = port.send(unit, pdu, now_ns) {
-                            *trouble = Some(e.to_string());
                             core.link_failed(now_ns);
+                            self.link_trouble(line, &e.to_string());
                         }
                     }
                 },
                 Step::Done { origin: Origin::Slot(slot), unit, result } => {
-                    let answered = result.is_ok();
-                    let lost = result.err();
+                    let (lost, refused) = (result.err(), result.ok().and_then(exception_of));
+                    let mut split = false;
                     if let Some(Use::Batch(batch)) = uses.get(slot).copied() {
-                        let split = batch_done(&plan.batches[batch], result, &mut self.inputs, now_ns);
+                        split = batch_done(&plan.batches[batch], result, &mut self.inputs, now_ns);
                         self.fresh = true;
                         if split {
                             self.split(line, batch, now_ns);
                         }
                     }
-                    self.unit_news(line, unit, answered, lost, now_ns);
+                    if lost.is_none() && !split {
+                        self.refusal(line, slot, unit, refused);
+                    }
+                    self.line_news(line, lost, now_ns);
                 }
-                Step::Done { origin: Origin::Job(id), unit, result } => {
+                Step::Done { origin: Origin::Job(id), result, .. } => {
                     let result = result.map(<[u8]>::to_vec);
-                    let (answered, lost) = (result.is_ok(), result.as_ref().err().copied());
+                    let lost = result.as_ref().err().copied();
                     self.job_done(id, result);
-                    self.unit_news(line, unit, answered, lost, now_ns);
+                    self.line_news(line, lost, now_ns);
                 }
             }
         }
@@ -292,6 +304,10 @@ impl Service {
         }
         for line in 0..self.runners.len() {
             self.rewrite(line, now_ns);
+        }
+        let state = if self.is_degraded() { HealthState::Degraded } else { HealthState::Ready };
+        if std::mem::replace(&mut self.state, state) != state {
+            self.ctx.set_state(state);
         }
         if beats.is_multiple_of(STATUS_BEATS) {
             self.status();

@@ -31,7 +31,7 @@ pub(crate) fn unit_rows(
             name: name_of(view.unit),
             state: view.state,
             counters: view.counters,
-            last_exception: view.last_exception.map(|code| exception_words(code, 0)),
+            last_exception: view.last_exception.map(|(code, function)| exception_words(code, function)),
             rtt_us: view.last_rtt_ns.map(|ns| ns / 1000),
             max_rtt_us: view.max_rtt_ns / 1000,
         })

@@ -1,7 +1,8 @@
 //! What the service declares and checks without starting.
 
-use super::config::{Config, Mode, OnBad as OnBadWord};
+use super::config::{Config, Mode, OnBad as OnBadWord, UnitRef};
 use super::image::InputTable;
+use super::order::Order;
 use super::plan::{Plan, ReadRange, Target, plan};
 use crate::map_config::traditional_number;
 use dinrail_iec::{Addressing, parse_address};
@@ -42,7 +43,12 @@ pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
             bytes: range.bytes,
             type_name: type_name(&write.from, write.iec, write.symbol.is_some(), addressing),
             symbol: write.symbol.clone(),
-            label: format!("to unit {}, {}", range.unit, points(range.table, range.at, range.count)),
+            label: format!(
+                "to unit {}, {}{}",
+                range.unit,
+                points(range.table, range.at, range.count),
+                order(range.group, range.order)
+            ),
             key: format!("write[{}].from", range.index),
             on_bad: OnBad::Hold,
             status_byte: None,
@@ -51,13 +57,19 @@ pub fn topics(config: &Config, neighbours: &Neighbours) -> Wiring {
     wiring
 }
 
-fn points(table: crate::server::Table, at: u16, count: u16) -> String {
+/// Entries in words: `holding_registers 0-1 (40001...)`.
+pub(super) fn points(table: crate::server::Table, at: u16, count: u16) -> String {
     let first = traditional_number(table, at);
     if count == 1 {
         format!("{} {at} ({first})", table.name())
     } else {
         format!("{} {at}-{} ({first}...)", table.name(), u32::from(at) + u32::from(count) - 1)
     }
+}
+
+/// The order of values of several registers.
+fn order(group: usize, order: Order) -> String {
+    if group > 1 { format!(" {}", order.name()) } else { String::new() }
 }
 
 /// IEC type of a symbol: as given, or by the width of its address.
@@ -92,7 +104,12 @@ fn input_range(config: &Config, range: &ReadRange) -> ImageRange {
         bytes: range.bytes,
         type_name,
         symbol: read.symbol.clone(),
-        label: format!("from unit {}, {}", range.unit, points(range.table, range.at, range.count)),
+        label: format!(
+            "from unit {}, {}{}",
+            range.unit,
+            points(range.table, range.at, range.count),
+            order(range.group, range.order)
+        ),
         key: format!("read[{}].to", range.index),
         on_bad: match range.on_bad {
             OnBadWord::Hold => OnBad::Hold,
@@ -147,6 +164,39 @@ fn masters(entry: &ServiceEntry) -> impl Iterator<Item = &str> {
     own.into_iter().chain(more).filter(move |_| is_master)
 }
 
+/// Units that only a number names beside others that are declared: each once. They work, and are typing errors.
+fn undeclared(config: &Config, me: &str) -> Vec<Finding> {
+    if config.units.is_empty() {
+        return Vec::new();
+    }
+    let reads = config.reads.iter().enumerate().map(|(i, read)| (format!("read[{i}].unit"), &read.unit));
+    let writes = config.writes.iter().enumerate().map(|(i, write)| (format!("write[{i}].unit"), &write.unit));
+    let declared: Vec<String> = config
+        .units
+        .iter()
+        .map(|unit| match &unit.name {
+            Some(name) => format!("{} (\"{name}\")", unit.id),
+            None => unit.id.to_string(),
+        })
+        .collect();
+    let (mut told, mut found) = (Vec::new(), Vec::new());
+    for (key, unit) in reads.chain(writes) {
+        // 0 is the broadcast.
+        let &UnitRef::Number(number @ 1..) = unit else { continue };
+        if config.units.iter().any(|unit| unit.id == number) || told.contains(&number) {
+            continue;
+        }
+        told.push(number);
+        let message = format!(
+            "unit {number} has no [[service.unit]], as other units have; did you mean {}?",
+            declared.join(" or ")
+        );
+        let help = format!("write the unit meant, or add [[service.unit]] with id = {number}");
+        found.push(Finding::warning(me, &key, message, help));
+    }
+    found
+}
+
 /// Every mistake that can be found without starting.
 pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> {
     let name = &me.name;
@@ -168,6 +218,7 @@ pub fn check(config: &Config, stack: &Stack, me: &ServiceEntry) -> Vec<Finding> 
             found.push(Finding::warning(name, &format!("read[{i}].timeout"), message, help));
         }
     }
+    found.extend(undeclared(config, name));
     if let Some(service) = &config.serial {
         found.extend(check_serial(name, "serial", service, config.mode == Some(Mode::Ascii), stack));
     }

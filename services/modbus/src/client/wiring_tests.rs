@@ -47,7 +47,7 @@ fn wiring() {
     assert_eq!(
         inputs,
         [
-            (4, 4, Some("REAL"), "from unit 5, input_registers 0-1 (30001...)"),
+            (4, 4, Some("REAL"), "from unit 5, input_registers 0-1 (30001...) ABCD"),
             (8, 2, None, "from unit 5, coils 3-14 (00004...)")
         ]
     );
@@ -71,8 +71,11 @@ fn findings() {
     short["stale_after"] = json!("10ms");
     let mut early = demo();
     early["read"][0]["timeout"] = json!("900ms");
+    let mut typo = demo();
+    typo["unit"] = json!([{ "id": 3, "name": "main" }, { "id": 4 }]);
     let all = [
         said(json!({ "tcp": "10.0.0.1:502" }), vec![]),
+        said(typo, vec![serial("rtu"), plc()]),
         said(demo(), vec![plc()]),
         said(demo(), vec![entry("com2", "serial", json!({})), plc()]),
         said(demo(), vec![serial("ascii"), plc()]),
@@ -100,6 +103,7 @@ fn findings() {
     ];
     insta::assert_snapshot!(all.join("\n"), @r#"
     : the service has neither read nor write -> add [[service.read]] or [[service.write]]; jobs of others are carried out in any case
+    read[0].unit: unit 5 has no [[service.unit]], as other units have; did you mean 3 ("main") or 4? -> write the unit meant, or add [[service.unit]] with id = 5
     serial: there is no serial service 'com1' -> add a [[service]] with kind = "serial"
     serial: there is no serial service 'com1' -> set it to one of: com2
     serial: serial service 'com1' has framing "ascii" -> set framing = "rtu" there, or change mode here

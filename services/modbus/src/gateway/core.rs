@@ -7,7 +7,8 @@
 
 use super::cache::Cache;
 use crate::client::line::{
-    Failure, Line, LineCounters, Origin, Settings, SlotKind, Step, UnitSettings, UnitState, UnitView,
+    Failure, Line, LineCounters, Origin, Settings, SlotKind, Step, UnitNews, UnitSettings, UnitState,
+    UnitView,
 };
 use crate::protocol::pdu::{EXCEPTION_BIT, Exception, MAX_PDU};
 use serde::Serialize;
@@ -274,6 +275,10 @@ impl Core {
         if let Some(lane) = self.lanes.get_mut(line) {
             lane.line.link_failed(now_ns);
         }
+    }
+    /// See [`Line::unit_news`].
+    pub fn unit_news(&mut self, line: usize) -> Option<UnitNews> {
+        self.lanes.get_mut(line)?.line.unit_news()
     }
     /// State of a unit of a line.
     pub fn unit_state(&self, line: usize, unit: u8) -> UnitState {

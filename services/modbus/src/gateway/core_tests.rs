@@ -70,29 +70,38 @@ fn exceptions_of_the_gateway_itself() {
     steps(&mut core, 0, 0);
     core.sent(0, 0);
     core.garbage(0);
+    assert_eq!(steps(&mut core, 0, 30 * MS), Vec::<String>::new());
     assert_eq!(steps(&mut core, 0, 100 * MS), ["reply 1/1 9 [83, 0B]"]);
-    core.request(1, 2, 9, &READ, 101 * MS);
-    assert_eq!(steps(&mut core, 0, 101 * MS), ["reply 1/2 9 [83, 0B]"]);
+    for at_ms in [100, 200] {
+        assert_eq!(core.unit_news(0), None);
+        core.request(1, 2, 9, &READ, at_ms * MS);
+        assert_eq!(steps(&mut core, 0, at_ms * MS), ["send 9 [03, 00, 00, 00, 01]"]);
+        core.sent(0, at_ms * MS);
+        assert_eq!(steps(&mut core, 0, (at_ms + 100) * MS), ["reply 1/2 9 [83, 0B]"]);
+    }
+    assert!(core.unit_news(0).is_some_and(|news| news.unit == 9 && news.dead));
+    core.request(1, 2, 9, &READ, 301 * MS);
+    assert_eq!(steps(&mut core, 0, 301 * MS), ["reply 1/2 9 [83, 0B]"]);
     // The queue has 4 places besides the one in flight... which keeps its own.
     for transaction in 0..4 {
-        assert_eq!(core.request(1, transaction, 1, &READ, 200 * MS), None);
+        assert_eq!(core.request(1, transaction, 1, &READ, 500 * MS), None);
     }
-    assert_eq!(core.request(1, 9, 1, &READ, 200 * MS), Some(&[0x83, 6][..]));
+    assert_eq!(core.request(1, 9, 1, &READ, 500 * MS), Some(&[0x83, 6][..]));
     // Waiting for too long: 06 as well. The first one is in flight and silent.
-    steps(&mut core, 0, 200 * MS);
-    core.link_failed(0, 300 * MS);
+    steps(&mut core, 0, 500 * MS);
+    core.link_failed(0, 600 * MS);
     assert_eq!(
-        steps(&mut core, 0, 300 * MS),
+        steps(&mut core, 0, 600 * MS),
         ["reply 1/0 1 [83, 0A]", "reply 1/1 1 [83, 0A]", "reply 1/2 1 [83, 0A]", "reply 1/3 1 [83, 0A]"]
     );
     for transaction in 0..2 {
-        assert_eq!(core.request(1, transaction, 1, &READ, 500 * MS), None);
+        assert_eq!(core.request(1, transaction, 1, &READ, 800 * MS), None);
     }
-    steps(&mut core, 0, 500 * MS);
-    let said = steps(&mut core, 0, 1500 * MS);
+    steps(&mut core, 0, 800 * MS);
+    let said = steps(&mut core, 0, 1800 * MS);
     assert_eq!(said, ["reply 1/1 1 [83, 06]"]);
     let counters = core.counters();
-    assert_eq!((counters.no_path, counters.no_answer, counters.busy), (5, 2, 2));
+    assert_eq!((counters.no_path, counters.no_answer, counters.busy), (5, 4, 2));
 }
 
 #[test]

@@ -4,6 +4,7 @@ use super::config::Config;
 use super::core::Core;
 use crate::admission::Admission;
 use crate::protocol::mbap::{self, MAX_RECEIVED, Scan};
+use crate::visits::{Visits, leaving_is_told, untold_words};
 use ipc_types::clock;
 use ipc_types::event::Level;
 use ipc_types::net::Seldom;
@@ -62,6 +63,7 @@ pub(super) struct Shared {
     pub(super) next_client: Cell<u64>,
     pub(super) accepted: Cell<u64>,
     pub(super) refused: Cell<u64>,
+    visits: RefCell<Visits>,
     pub(super) events: RefCell<Vec<(Level, String)>>,
 }
 
@@ -80,6 +82,7 @@ impl Shared {
             next_client: Cell::new(1),
             accepted: Cell::new(0),
             refused: Cell::new(0),
+            visits: RefCell::default(),
             events: RefCell::new(Vec::new()),
         })
     }
@@ -137,17 +140,23 @@ impl Shared {
             requests: Cell::new(0),
             last_ns: Cell::new(now_ns),
         });
-        self.event(Level::Info, format!("Modbus master {peer} connected"));
+        let arrival = self.visits.borrow_mut().arrives(peer.ip(), now_ns);
+        match arrival {
+            Some(n) => self.event(Level::Info, format!("Modbus master {peer} connected{}", untold_words(n))),
+            None => tracing::debug!("Modbus master {peer} connected"),
+        }
         self.clients.borrow_mut().push(client.clone());
         let shared = self.clone();
         tokio::task::spawn_local(async move {
             shared.serve(&client).await;
             shared.clients.borrow_mut().retain(|other| !Rc::ptr_eq(other, &client));
             shared.core.borrow_mut().client_gone(client.id);
-            shared.event(
-                Level::Info,
-                format!("Modbus master {peer} left after {} requests", client.requests.get()),
-            );
+            let left = format!("Modbus master {peer} left after {} requests", client.requests.get());
+            if leaving_is_told(arrival, clock::mono_ns().saturating_sub(client.since_ns)) {
+                shared.event(Level::Info, left);
+            } else {
+                tracing::debug!("{left}");
+            }
         });
     }
 

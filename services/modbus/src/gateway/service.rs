@@ -8,10 +8,12 @@ use super::config::{Config, Plan};
 use super::core::{Core, GatewayStep};
 use super::masters::Shared;
 use crate::client::alarm::Alarm;
+use crate::client::line::UnitNews;
 use crate::client::port::{Incoming, SerialPort};
 pub use crate::process::RunError;
 use crate::process::{Wake, Wakes, listener, run_here};
-use ipc_types::event::EventKind;
+use ipc_types::event::{Budget, EventKind, Level};
+use ipc_types::payload::HealthState;
 use ipc_types::topic::TopicKind;
 use ipc_types::turns::STATUS_BEATS;
 use ipc_types::{Context, clock};
@@ -21,6 +23,8 @@ use std::rc::Rc;
 
 /// Kind of the service in stack files.
 pub const KIND: &str = "modbus-gateway";
+/// Events a second about units and lines that go to the rail.
+const EVENTS_A_SECOND: u32 = 20;
 pub(super) const LISTENER: &str = "tcp";
 
 pub(super) struct Service {
@@ -28,8 +32,10 @@ pub(super) struct Service {
     pub(super) shared: Rc<Shared>,
     ports: Vec<SerialPort>,
     pub(super) names: Vec<String>,
-    /// Ports that were told not to work.
-    broken: Vec<bool>,
+    /// Why a port does not work.
+    broken: Vec<Option<String>>,
+    state: HealthState,
+    events: Budget,
     pub(super) listen: Option<SocketAddr>,
 }
 
@@ -58,8 +64,9 @@ async fn serve(mut ctx: Context) -> Result<(), RunError> {
     let shared = Shared::new(core, config);
     tokio::task::spawn_local(shared.clone().accept(listener));
     let names: Vec<String> = ports.into_iter().map(|port| port.serial).collect();
-    let broken = vec![false; names.len()];
-    let mut service = Service { ctx, shared, ports: open, names, broken, listen };
+    let broken = vec![None; names.len()];
+    let (state, events) = (HealthState::Ready, Budget::new(EVENTS_A_SECOND));
+    let mut service = Service { ctx, shared, ports: open, names, broken, state, events, listen };
     service.status();
     service.ctx.ready();
     let shared = service.shared.clone();
@@ -90,23 +97,31 @@ impl Service {
         let mut next_ns: Option<u64> = None;
         for line in 0..self.ports.len() {
             let shared = self.shared.clone();
-            let (port, broken) = (&mut self.ports[line], &mut self.broken[line]);
+            let port = &mut self.ports[line];
+            // Whether the last request has left.
+            let mut left = None;
             more |= !port.drain(|incoming| {
                 let mut core = shared.core.borrow_mut();
                 match incoming {
                     Incoming::Sent { t_ns } => {
-                        *broken = false;
+                        left = Some(true);
                         core.sent(line, t_ns);
                     }
                     Incoming::NotSent => {
-                        *broken = true;
+                        left = Some(false);
                         core.link_failed(line, clock::mono_ns());
                     }
                     Incoming::Frame { unit, pdu, t_ns } => core.answer(line, unit, pdu, t_ns),
                     Incoming::Garbage => core.garbage(line),
                 }
             });
+            match left {
+                Some(true) => self.line_state(line, None),
+                Some(false) => self.line_state(line, Some("the serial port does not work; see its status")),
+                None => {}
+            }
             next_ns = next_ns.into_iter().chain(self.pump(line)).min();
+            self.tell_units(line);
         }
         if more { Some(1) } else { next_ns }
     }
@@ -120,11 +135,8 @@ impl Service {
                 GatewayStep::Wait(until) => return until,
                 GatewayStep::Send { unit, pdu } => {
                     if let Err(e) = self.ports[line].send(unit, pdu, now_ns) {
-                        if !self.broken[line] {
-                            tracing::warn!("{e}");
-                        }
-                        self.broken[line] = true;
                         core.link_failed(line, now_ns);
+                        self.line_state(line, Some(&e.to_string()));
                     }
                 }
                 GatewayStep::Reply { client, transaction, unit, pdu } => {
@@ -137,6 +149,50 @@ impl Service {
         }
     }
 
+    /// Units that have gone or come back: each told once.
+    fn tell_units(&mut self, line: usize) {
+        let shared = self.shared.clone();
+        while let Some(UnitNews { unit, dead, .. }) = shared.core.borrow_mut().unit_news(line) {
+            let name = &self.names[line];
+            let (level, message) = if dead {
+                (
+                    Level::Warning,
+                    format!(
+                        "unit {unit} on {name} does not answer; masters get exception 0B at once, and it is tried again from time to time"
+                    ),
+                )
+            } else {
+                (Level::Info, format!("unit {unit} on {name} answers again"))
+            };
+            self.tell(level, message);
+        }
+    }
+
+    /// Whether a line works, and why not: told when it changes.
+    fn line_state(&mut self, line: usize, why: Option<&str>) {
+        if self.broken[line].as_deref() == why {
+            return;
+        }
+        self.broken[line] = why.map(str::to_owned);
+        let name = &self.names[line];
+        let (level, message) = match why {
+            Some(why) => (Level::Warning, format!("{name}: {why}; masters get exception 0A meanwhile")),
+            None => (Level::Info, format!("{name} works again")),
+        };
+        self.tell(level, message);
+        let broken = self.broken.iter().any(Option::is_some);
+        let state = if broken { HealthState::Degraded } else { HealthState::Ready };
+        if std::mem::replace(&mut self.state, state) != state {
+            self.ctx.set_state(state);
+        }
+    }
+
+    fn tell(&mut self, level: Level, message: String) {
+        if self.events.take() {
+            self.ctx.event(EventKind::BusState, level, message, Value::Null);
+        }
+    }
+
     fn beat(&mut self, beats: u32) {
         self.ctx.beat();
         let events: Vec<_> = self.shared.events.borrow_mut().drain(..).collect();
@@ -144,6 +200,10 @@ impl Service {
             self.ctx.event(EventKind::Client, level, message, Value::Null);
         }
         if beats.is_multiple_of(STATUS_BEATS) {
+            if let Some(left_out) = self.events.renew() {
+                let message = format!("{left_out} more changes in the last second left out");
+                self.ctx.event(EventKind::BusState, Level::Warning, message, Value::Null);
+            }
             self.sweep();
             self.status();
         }

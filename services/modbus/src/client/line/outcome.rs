@@ -1,6 +1,9 @@
 //! What becomes of the request in flight: answered, repeated, given up.
 
-use super::{DEAD_AFTER, Ended, Failure, Flight, LINK_PAUSE_NS, Line, Origin, Phase, SlotKind, UnitState, is_of_gateway};
+use super::{
+    DEAD_AFTER, Ended, Failure, Flight, LINK_PAUSE_NS, Line, Origin, Phase, SlotKind, UnitState,
+    is_of_gateway,
+};
 use crate::protocol::pdu::Exception;
 
 /// Whether the same request may be carried out later: the device failed at it now, or is busy.
@@ -117,6 +120,7 @@ impl Line {
         let Some(flight) = self.flight.take() else { return };
         let unit = &mut self.units[flight.unit];
         unit.failures = unit.failures.saturating_add(1);
+        unit.by_gateway = true;
         unit.cost_ns = now_ns.saturating_sub(flight.begun_ns);
         (self.link_level, self.link_down) = (0, false);
         self.give_up(&flight, Failure::NoAnswer, now_ns);
@@ -129,6 +133,7 @@ impl Line {
         unit.counters.timeouts += u64::from(failure == Failure::NoAnswer);
         let was_dead = unit.state == UnitState::Dead;
         unit.failures = unit.failures.saturating_add(1);
+        unit.by_gateway = false;
         unit.cost_ns = now_ns.saturating_sub(flight.begun_ns);
         if self.settings.serial && failure == Failure::NoAnswer && !flight.damaged {
             let until_ns = now_ns.saturating_add(unit.settings.response_timeout_ns);

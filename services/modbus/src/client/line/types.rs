@@ -120,6 +120,15 @@ pub struct UnitCounters {
     pub discarded: u64,
 }
 
+/// A unit that has gone dead or come back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct UnitNews {
+    pub unit: u8,
+    pub dead: bool,
+    /// A gateway says that it does not reach the unit, by this exception.
+    pub by_gateway: Option<u8>,
+}
+
 /// A unit as the status shows it.
 #[derive(Debug, Clone, Copy)]
 pub struct UnitView {

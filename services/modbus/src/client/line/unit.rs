@@ -16,6 +16,8 @@ pub(super) struct Unit {
     pub(super) failures: u32,
     /// That it is dead was told.
     pub(super) told_dead: bool,
+    /// The last try failed because a gateway does not reach the unit.
+    pub(super) by_gateway: bool,
     /// Line time of the last try without an answer.
     pub(super) cost_ns: u64,
     /// Requests whose late answers may still come.
@@ -51,6 +53,7 @@ impl Unit {
             level: 0,
             failures: 0,
             told_dead: false,
+            by_gateway: false,
             cost_ns: 0,
             suspects: [Suspect { pdu: Pdu::new(&[]), until_ns: 0, outstanding: 0, answered: false };
                 SUSPECTS],

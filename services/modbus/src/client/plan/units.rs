@@ -78,7 +78,10 @@ pub fn find_unit(lines: &[LinePlan], unit: &UnitRef, has_own: bool) -> Result<(u
             Some((line, unit)) => Ok((line, unit.unit)),
             None => {
                 let names: Vec<&str> = all().filter_map(|(_, u)| u.name.as_deref()).collect();
-                Err(format!("no unit has the name '{name}'; there are: {}", names.join(", ")))
+                Err(match names.as_slice() {
+                    [] => format!("no unit has the name '{name}', and none has any name"),
+                    names => format!("no unit has the name '{name}'; there are: {}", names.join(", ")),
+                })
             }
         },
         UnitRef::Number(number) => {
@@ -98,6 +101,17 @@ pub fn find_unit(lines: &[LinePlan], unit: &UnitRef, has_own: bool) -> Result<(u
     }
 }
 
+/// Whether a unit was declared and left out because it has no line.
+fn lacks_line(config: &Config, unit: &UnitRef, plan: &Plan) -> bool {
+    match unit {
+        UnitRef::Name(name) => config.units.iter().any(|u| u.name.as_ref() == Some(name)),
+        UnitRef::Number(number) => {
+            let planned = plan.lines.iter().any(|line| line.units.iter().any(|u| u.unit == *number));
+            !planned && config.units.iter().any(|u| u.id == *number)
+        }
+    }
+}
+
 pub(super) fn unit_of(config: &Config, unit: &UnitRef, key: &str, plan: &mut Plan) -> Option<(usize, u8)> {
     match find_unit(&plan.lines, unit, own_target(config).is_some()) {
         Ok((line, number)) => {
@@ -107,6 +121,8 @@ pub(super) fn unit_of(config: &Config, unit: &UnitRef, key: &str, plan: &mut Pla
             }
             Some((line, number))
         }
+        // What is wrong with its line was told.
+        Err(_) if plan.lines.is_empty() || lacks_line(config, unit, plan) => None,
         Err(message) => {
             plan.wrong(format!("{key}.unit"), message, "add a [[service.unit]], or correct the unit");
             None

@@ -7,6 +7,7 @@ use super::super::link::{Link, Reports};
 use super::super::plan::{Batch, LinePlan, Target};
 use super::super::port::{SEND_LIMIT_NS, SerialPort};
 use super::{KIND, RunError};
+use crate::server::Table;
 use ipc_types::Context;
 use ipc_types::topic::TopicKind;
 
@@ -22,15 +23,43 @@ pub(super) enum Use {
     Write,
 }
 
+/// What a slot reads or writes, and whether the unit does it.
+pub(super) struct Place {
+    pub(super) table: Table,
+    pub(super) at: u16,
+    pub(super) count: u16,
+    /// Function and code of the exception that the last request got.
+    pub(super) refused: Option<(u8, u8)>,
+}
+
+impl Place {
+    pub(super) fn new(table: Table, at: u16, count: u16) -> Self {
+        Self { table, at, count, refused: None }
+    }
+
+    /// What was not so at the last answer: that it is refused, or no longer.
+    pub(super) fn changed(&mut self, refused: Option<(u8, u8)>) -> bool {
+        std::mem::replace(&mut self.refused, refused) != refused
+    }
+}
+
+/// Function and code, if an answer is an exception.
+pub(super) fn exception_of(answer: &[u8]) -> Option<(u8, u8)> {
+    match *answer {
+        [function, code] if function & 0x80 != 0 => Some((function & 0x7F, code)),
+        _ => None,
+    }
+}
+
 pub(super) struct Runner {
     pub(super) plan: LinePlan,
     pub(super) line: Line,
     pub(super) transport: Transport,
     pub(super) uses: Vec<Use>,
+    /// Of each slot.
+    pub(super) places: Vec<Place>,
     /// Slot of each batch.
     pub(super) batch_slots: Vec<usize>,
-    /// Units that were dead when last looked at.
-    pub(super) dead: Vec<u8>,
     /// Why the link does not work; `None`: it does, or was not needed.
     pub(super) trouble: Option<String>,
     pub(super) connected: bool,
@@ -96,7 +125,7 @@ pub(super) fn runner(
     for unit in &plan.units {
         line.set_unit(unit.unit, unit.settings);
     }
-    let (mut uses, mut batch_slots) = (Vec::new(), Vec::new());
+    let (mut uses, mut places, mut batch_slots) = (Vec::new(), Vec::new(), Vec::new());
     for (b, batch) in plan.batches.iter().enumerate() {
         let pdu = read_request(batch.table, batch.at, batch.count);
         let slot = line.add_slot(batch.unit, SlotKind::Read, &pdu, Some(batch.period_ns));
@@ -105,14 +134,15 @@ pub(super) fn runner(
         }
         batch_slots.push(slot);
         uses.push(Use::Batch(b));
+        places.push(Place::new(batch.table, batch.at, batch.count));
     }
     Ok(Runner {
         plan,
         line,
         transport,
         uses,
+        places,
         batch_slots,
-        dead: Vec::new(),
         trouble: None,
         connected: false,
         rewrite: Rewrite::default(),
@@ -155,6 +185,17 @@ pub(super) fn drop_write(runners: &mut [Runner], slots: &[(usize, usize)], i: us
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_refusal_is_told_once_and_when_it_changes() {
+        let mut place = Place::new(Table::HoldingRegisters, 100, 2);
+        let said: Vec<bool> = [&[3, 2, 0, 1][..], &[0x83, 2], &[0x83, 2], &[0x83, 3], &[3, 2, 0, 1], &[6, 0]]
+            .iter()
+            .map(|answer| place.changed(exception_of(answer)))
+            .collect();
+        assert_eq!(said, [false, true, false, true, true, false]);
+        assert_eq!(exception_of(&[0x83, 2]), Some((3, 2)));
+    }
 
     #[test]
     fn outputs_are_written_again_at_once_and_then_not_for_a_while() {

@@ -1,13 +1,18 @@
 //! What `<service>/status` shows.
 
+use super::super::ask::exception_words;
 use super::super::line::LineCounters;
 use super::super::unit_row::{UnitRow, unit_rows};
-use super::{Runner, STATUS_UNITS, Service, Transport};
+use super::super::wiring::points;
+use super::{Runner, STATUS_UNITS, Service, Transport, Use};
 use ipc_types::event::{EventKind, Level};
 use ipc_types::outputs::Unsafe;
 use ipc_types::payload::Quality;
 use serde::Serialize;
 use serde_json::Value;
+
+/// Refused ranges shown.
+const REFUSED: usize = 8;
 
 #[derive(Serialize)]
 struct LineRow {
@@ -30,6 +35,9 @@ pub(super) struct Status {
     good: usize,
     stale: usize,
     no_data: usize,
+    /// Reads and writes that units refuse, the first of them.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    refused: Vec<String>,
     /// Absent: writes follow the image.
     #[serde(skip_serializing_if = "Option::is_none")]
     safe: Option<Unsafe>,
@@ -58,11 +66,31 @@ impl Service {
             good: count(Quality::Good),
             stale: count(Quality::Stale),
             no_data: count(Quality::NoData),
+            refused: self.refused(),
             safe: self.image.why(),
             jobs: self.jobs_done,
             jobs_failed: self.jobs_failed,
             images_too_small: self.writes.outside(),
         }
+    }
+}
+
+impl Service {
+    fn refused(&self) -> Vec<String> {
+        let slots = self
+            .runners
+            .iter()
+            .flat_map(|runner| runner.places.iter().zip(&runner.uses).map(move |p| (runner, p)));
+        let words = slots.filter_map(|(runner, (place, used))| {
+            let (function, code) = place.refused?;
+            let unit = match used {
+                Use::Batch(batch) => format!("unit {}, ", runner.plan.batches[*batch].unit),
+                Use::Write => String::new(),
+            };
+            let what = points(place.table, place.at, place.count);
+            Some(format!("{unit}{what}: {}", exception_words(code, function)))
+        });
+        words.take(REFUSED).collect()
     }
 }
 
