@@ -367,17 +367,23 @@ fn the_launcher_is_killed_no_orphan_lives_and_the_next_up_runs() {
         stat.rsplit_once(") ").is_some_and(|(_, rest)| !rest.starts_with(['Z', 'X']))
     };
     support::wait_for("no orphan lives", Duration::from_secs(10), || (!pids.iter().any(lives)).then_some(()));
-    // The same stack again: what the dead launcher left is wiped.
     let file = stack.scratch.0.join("stack.toml");
-    stack.launcher = dinrail()
-        .arg("up")
-        .arg(&file)
-        .stderr(std::process::Stdio::null())
-        .stdout(std::process::Stdio::null())
-        .spawn()
-        .unwrap();
+    let again = || {
+        let mut up = dinrail();
+        up.arg("up").arg(&file).stderr(std::process::Stdio::null()).stdout(std::process::Stdio::null());
+        up.spawn().unwrap()
+    };
+    // The same stack again: what the dead launcher left is wiped.
+    stack.launcher = again();
     stack.wait_ready();
     works(&stack, port);
+    stack.launcher.kill().unwrap();
+    stack.launcher.wait().unwrap();
+    // Who does not want it again clears up.
+    let said = stack.ok(&["down"]);
+    assert!(said.contains("was not running") && !stack.root().exists(), "{said}");
+    stack.launcher = again();
+    stack.wait_ready();
     assert_eq!(stack.take_down(), 0);
 }
 

@@ -231,15 +231,27 @@ impl Context {
             Level::Warning => tracing::warn!("{}", body.message),
             Level::Fault => tracing::error!("{}", body.message),
         }
-        let mut text = serde_json::to_vec(&body).unwrap_or_default();
-        if text.len() > self.events.max_tail() as usize {
-            body.detail = serde_json::json!("left out: too long");
-            body.message.truncate(body.message.floor_char_boundary(1024));
-            text = serde_json::to_vec(&body).unwrap_or_default();
-        }
+        let text = fit(&mut body, self.events.max_tail() as usize);
         let _ = self.events.send_tail(Event::default(), &text);
         self.events.ring();
     }
+}
+
+/// The event as JSON of at most `max` bytes: the detail goes first, then the end of the message.
+fn fit(body: &mut EventBody, max: usize) -> Vec<u8> {
+    let mut text = serde_json::to_vec(body).unwrap_or_default();
+    if text.len() > max {
+        body.detail = serde_json::json!("left out: too long");
+        text = serde_json::to_vec(body).unwrap_or_default();
+    }
+    // One character may take six bytes there: quotes, control characters.
+    let mut room = 1024;
+    while text.len() > max && room > 0 {
+        body.message.truncate(body.message.floor_char_boundary(room));
+        text = serde_json::to_vec(body).unwrap_or_default();
+        room /= 2;
+    }
+    text
 }
 
 /// A tool is known by its process id, and ids come again: a later tool is a later generation, or its first
@@ -264,6 +276,22 @@ fn find<'a>(stack: &'a Stack, topic: &str) -> Result<&'a TopicEntry, RailError> 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_event_that_is_too_long_loses_its_detail_then_the_end_of_its_message() {
+        let body = |message: String, detail| EventBody::now(EventKind::Loaded, Level::Info, "plc", message, detail);
+        let told = |mut body: EventBody| {
+            let text = fit(&mut body, 2048);
+            assert!(!text.is_empty() && text.len() <= 2048, "{}", text.len());
+            serde_json::from_slice::<EventBody>(&text).map_err(|e| e.to_string())
+        };
+        let short = told(body("loaded".into(), serde_json::json!({ "hash": 7 }))).map(|b| (b.message, b.detail));
+        assert_eq!(short, Ok(("loaded".into(), serde_json::json!({ "hash": 7 }))));
+        let long = told(body("loaded".into(), serde_json::json!("x".repeat(4000)))).map(|b| b.message);
+        assert_eq!(long, Ok("loaded".into()));
+        let quotes = told(body("\u{1}".repeat(1024), serde_json::Value::Null)).map(|b| b.message.len());
+        assert!(quotes.as_ref().is_ok_and(|len| *len >= 128), "{quotes:?}");
+    }
 
     #[test]
     fn a_later_tool_is_a_later_generation() {

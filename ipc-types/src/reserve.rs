@@ -56,6 +56,11 @@ pub fn reserve(shm: &Path, prefix: &str) -> std::io::Result<Reserved> {
         if there >= size {
             continue;
         }
+        // An attempt that cannot succeed would take all that is left for a moment, under the feet of everybody else.
+        if rustix::fs::fstatvfs(&folder).is_ok_and(|room| is_short(&room, size - there)) {
+            found.missing += size - there;
+            continue;
+        }
         let Ok(object) = rustix::fs::openat(&folder, &name, flags, Mode::empty()) else { continue };
         loop {
             match rustix::fs::fallocate(&object, FallocateFlags::KEEP_SIZE, 0, size) {
@@ -70,6 +75,11 @@ pub fn reserve(shm: &Path, prefix: &str) -> std::io::Result<Reserved> {
         }
     }
     Ok(found)
+}
+
+/// Whether so many bytes are not there; a file system without a limit says that it has no blocks at all.
+fn is_short(room: &rustix::fs::StatVfs, bytes: u64) -> bool {
+    room.f_blocks > 0 && room.f_bavail.saturating_mul(room.f_frsize) < bytes
 }
 
 #[cfg(test)]

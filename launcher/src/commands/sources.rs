@@ -165,7 +165,7 @@ mod tests {
         .unwrap();
         let stack = folder.0.join("stack.toml");
         std::fs::write(&stack, STACK).unwrap();
-        let with = Program::read(&args(&[file.clone()], Some(stack.clone()))).unwrap();
+        let with = Program::read(&args(std::slice::from_ref(&file), Some(stack.clone()))).unwrap();
         with.compile("nothing").unwrap();
         let without = Program::read(&args(&[file], None)).unwrap();
         let said = without.compile("nothing was written").unwrap_err().to_string();

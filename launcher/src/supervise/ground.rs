@@ -36,15 +36,20 @@ pub enum GroundError {
     Retain { service: String, bytes: u32, source: io::Error },
 }
 
-/// Removes what an earlier run left, its processes too, and makes the stack's folder with its two files.
-pub fn prepare(stack: &Stack) -> Result<(), GroundError> {
-    if stack.root.exists() {
-        if state_dir::answers(&stack.root) {
-            return Err(GroundError::Answers(stack.root.clone()));
+/// Removes what an earlier run left, its processes too. Call with the stack's lock held.
+pub fn clear(root: &Path, prefix: &str) -> Result<(), GroundError> {
+    if root.exists() {
+        if state_dir::answers(root) {
+            return Err(GroundError::Answers(root.to_owned()));
         }
-        end_leftovers(&stack.root)?;
+        end_leftovers(root)?;
     }
-    wipe(&stack.root, &stack.prefix)?;
+    wipe(root, prefix)
+}
+
+/// [`clear`]s, and makes the stack's folder with its two files.
+pub fn prepare(stack: &Stack) -> Result<(), GroundError> {
+    clear(&stack.root, &stack.prefix)?;
     let fail = |source| GroundError::Folder { path: stack.root.clone(), source };
     DirBuilder::new().mode(0o700).create(&stack.root).map_err(fail)?;
     let write = |name: &str, text: &[u8]| {

@@ -87,6 +87,8 @@ pub struct Outcome {
     pub failed: Option<String>,
     /// Services that were down at the end.
     pub held: Vec<String>,
+    /// Services that were degraded when they last spoke at work. Told, but no fault: a line may be unplugged for good reason.
+    pub degraded: Vec<String>,
     /// What the recorders lost.
     pub losses: Vec<String>,
 }

@@ -47,12 +47,16 @@ impl Outbox {
 
     /// An event that goes out now: kept when a recorder does not hear it.
     pub fn note(&mut self, body: &EventBody) {
-        if body.event == EventKind::Died
-            && let Some(recorder) = self.recorders.iter_mut().find(|r| r.name == body.service)
-        {
-            let generation = body.detail.get("generation").and_then(Value::as_u64).unwrap_or(0);
-            recorder.from = generation as u32 + 1;
-            recorder.ready = false;
+        if let Some(recorder) = self.recorders.iter_mut().find(|r| r.name == body.service) {
+            let generation = body.detail.get("generation").and_then(Value::as_u64).unwrap_or(0) as u32;
+            match body.event {
+                EventKind::Died => (recorder.from, recorder.ready) = (generation.saturating_add(1), false),
+                // Restarted by command, which is no death.
+                EventKind::Started if generation > recorder.from => {
+                    (recorder.from, recorder.ready) = (generation, false);
+                }
+                _ => {}
+            }
         }
         if self.recorders.iter().all(|r| r.ready) {
             return;
@@ -122,6 +126,20 @@ mod tests {
         assert_eq!(kinds(&heard), [EventKind::Died, EventKind::Started]);
         assert_eq!((heard[0].t_ns, heard[0].utc_ns), (died.t_ns, died.utc_ns), "stamped when it happened");
         assert!(outbox.again(&[beat(1, 2, HealthState::Ready)]).is_empty(), "once");
+    }
+
+    #[test]
+    fn a_recorder_that_was_restarted_by_command_hears_what_happens_until_it_listens() {
+        let mut outbox = Outbox::with([(0, "rec".to_owned())].into_iter());
+        assert!(outbox.again(&[beat(0, 1, HealthState::Ready)]).is_empty());
+        outbox.note(&event("rec", EventKind::Restarting, 2));
+        outbox.note(&event("rec", EventKind::Started, 2));
+        outbox.note(&event("plc", EventKind::Died, 1));
+        assert!(outbox.again(&[beat(0, 1, HealthState::Ready)]).is_empty(), "a heartbeat from before");
+        let told = outbox.again(&[beat(0, 2, HealthState::Ready)]);
+        assert_eq!(kinds(&told), [EventKind::Started, EventKind::Died]);
+        outbox.note(&event("plc", EventKind::Started, 2));
+        assert!(outbox.again(&[]).is_empty(), "it heard that");
     }
 
     #[test]

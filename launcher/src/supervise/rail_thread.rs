@@ -25,6 +25,8 @@ use std::time::{Duration, SystemTime};
 const TURN: Duration = Duration::from_millis(20);
 /// The memory of the stack's objects is looked after so often.
 const STOCK_NS: u64 = 1_000_000_000;
+/// So long after the last change in /dev/shm what was made there has its size.
+const SETTLED: Duration = Duration::from_millis(500);
 /// Orders that may wait.
 const ORDERS_MAX: usize = 1024;
 /// Longest message of an event in bytes.
@@ -227,7 +229,8 @@ impl Stock {
             return None;
         }
         let complaint = reserve(shm, &stack.prefix).ok()?.complaint();
-        self.changed = changed;
+        // An object that was made this moment may get its size, or a neighbour of the same time stamp, right afterwards.
+        self.changed = changed.filter(|at| at.elapsed().is_ok_and(|age| age >= SETTLED));
         let before = std::mem::replace(&mut self.short, complaint.is_some());
         complaint.filter(|_| !before)
     }

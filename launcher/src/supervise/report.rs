@@ -113,6 +113,7 @@ pub fn summary(seen: &Observed, outcome: &Outcome, ran: Duration, restarts: u32,
             "restarts": restarts,
             "failed": outcome.failed,
             "held": outcome.held,
+            "degraded": outcome.degraded,
             "losses": outcome.losses,
             "plcs": seen.plcs.iter().map(|p| json!({ "plc": p.0, "scans": p.2 })).collect::<Vec<_>>(),
             "buses": seen.buses.iter().map(|b| json!({ "bus": b.0, "frames": b.1 })).collect::<Vec<_>>(),
@@ -130,6 +131,9 @@ pub fn summary(seen: &Observed, outcome: &Outcome, ran: Duration, restarts: u32,
     parts.push(format!("{restarts} restart{}", if restarts == 1 { "" } else { "s" }));
     parts.push(match &outcome.failed {
         Some(why) => format!("failed: {why}"),
+        None if outcome.exit_code() == 0 && !outcome.degraded.is_empty() => {
+            format!("degraded at the end: {}", outcome.degraded.join(", "))
+        }
         None if outcome.exit_code() == 0 => "healthy".to_owned(),
         None if outcome.exit_code() == 3 => "healthy, with data loss".to_owned(),
         None => "not healthy".to_owned(),
@@ -167,6 +171,9 @@ mod tests {
             healthy,
             "recording: recordings/a.mcap\nran 10.0 s, plc 9 scans, can0 3 frames, 0 restarts, healthy"
         );
+        let degraded = Outcome { degraded: vec!["can0".into(), "com1".into()], ..Outcome::default() };
+        let said = summary(&seen(9, 3), &degraded, Duration::from_secs(10), 0, false);
+        assert!(said.ends_with("0 restarts, degraded at the end: can0, com1"), "{said}");
         let lossy = Outcome { losses: vec!["rec: 3 messages".into()], ..Outcome::default() };
         let text = summary(&Observed::default(), &lossy, Duration::from_secs(1), 1, false);
         assert_eq!(text, "lost: rec: 3 messages\nran 1.0 s, 1 restart, healthy, with data loss");

@@ -145,18 +145,26 @@ fn read_state(file: &mut File) -> Option<RunningStack> {
     serde_json::from_str(&text).ok()
 }
 
-/// The stacks of this user whose launcher answers. Stale files of killed launchers are passed over.
-pub fn running() -> Vec<RunningStack> {
-    let mut list: Vec<RunningStack> = std::fs::read_dir(folder())
+/// What the files of the user's folder say.
+fn known() -> impl Iterator<Item = RunningStack> {
+    std::fs::read_dir(folder())
         .into_iter()
         .flatten()
         .flatten()
         .filter(|entry| entry.path().extension().is_some_and(|e| e == "json"))
         .filter_map(|entry| read_state(&mut File::open(entry.path()).ok()?))
-        .filter(|state| answers(&state.root))
-        .collect();
+}
+
+/// The stacks of this user whose launcher answers. Stale files of killed launchers are passed over.
+pub fn running() -> Vec<RunningStack> {
+    let mut list: Vec<RunningStack> = known().filter(|state| answers(&state.root)).collect();
     list.sort_by(|a, b| a.stack.cmp(&b.stack));
     list
+}
+
+/// Stacks of this user whose launcher was killed: nobody has stopped them.
+pub fn left_behind() -> Vec<RunningStack> {
+    known().filter(|state| !answers(&state.root)).collect()
 }
 
 /// Whether a launcher listens in this root.

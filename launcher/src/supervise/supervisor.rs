@@ -89,6 +89,8 @@ struct Service {
     child: Option<Child>,
     sources: Vec<Wake>,
     health: HealthState,
+    /// What it last said of itself while it was at work: ready, but not as it should be.
+    degraded: bool,
     cpu_ticks: u64,
     cpu_at: u64,
     cpu_percent: f64,
@@ -182,6 +184,7 @@ impl Supervisor {
             child: None,
             sources: Vec::new(),
             health: HealthState::Starting,
+            degraded: false,
             cpu_ticks: 0,
             cpu_at: 0,
             cpu_percent: 0.0,
@@ -340,7 +343,11 @@ impl Supervisor {
                     self.rail_ticks = 0;
                     for beat in beats {
                         if beat.generation == self.policy.slots()[beat.service].generation {
-                            self.services[beat.service].health = beat.state;
+                            let service = &mut self.services[beat.service];
+                            service.health = beat.state;
+                            if matches!(beat.state, HealthState::Ready | HealthState::Degraded) {
+                                service.degraded = beat.state == HealthState::Degraded;
+                            }
                         }
                         self.policy.beat(beat.service, beat.generation, beat.state, t_ns);
                     }
@@ -368,7 +375,11 @@ impl Supervisor {
             self.console
                 .out(json!({ "event": "ready", "services": count, "after_ms": after_ms }).to_string());
         } else {
-            self.console.out(format!("all {count} services ready after {after_ms} ms"));
+            let degraded = match self.degraded().join(", ") {
+                none if none.is_empty() => none,
+                some => format!("; degraded: {some} (`dinrail status` says why)"),
+            };
+            self.console.out(format!("all {count} services ready after {after_ms} ms{degraded}"));
             if let Some(tour) = self.options.tour.take() {
                 self.console.out(tour);
             }
@@ -440,6 +451,12 @@ impl Supervisor {
         nodes > self.services.iter().filter(|s| s.child.is_some()).count() + OWN_NODES
     }
 
+    /// Services that work, but say that something is not as it should be.
+    fn degraded(&self) -> Vec<String> {
+        let named = self.services.iter().zip(&self.stack.services);
+        named.filter(|(service, _)| service.degraded).map(|(_, entry)| entry.name.clone()).collect()
+    }
+
     /// Everything has ended: let go of the rail, say how it went.
     fn finish(mut self) -> Outcome {
         let ran = Duration::from_nanos(clock::mono_ns() - self.began);
@@ -460,6 +477,7 @@ impl Supervisor {
         let outcome = Outcome {
             failed: self.policy.failed().map(str::to_owned),
             held: self.held(),
+            degraded: self.degraded(),
             losses: std::mem::take(&mut self.losses),
         };
         if outcome.failed.is_none()

@@ -66,13 +66,9 @@ pub fn cat(path: &Path, filter: &Filter, format: Format, out: &mut impl Write) -
     let mut recording = Recording::open(path)?;
     let mut layouts: BTreeMap<u16, Option<Layout>> = BTreeMap::new();
     let mut messages = 0;
-    let mut seen: BTreeSet<String> = BTreeSet::new();
     while filter.limit.is_none_or(|limit| messages < limit) {
         let Some(item) = recording.next_item()? else { break };
         let Item::Message(message) = item else { continue };
-        if !filter.topics.is_empty() && !seen.contains(message.topic()) {
-            seen.insert(message.topic().to_owned());
-        }
         if !filter.takes(&message) {
             continue;
         }
@@ -88,6 +84,8 @@ pub fn cat(path: &Path, filter: &Filter, format: Format, out: &mut impl Write) -
     }
     out.flush()?;
     let whole = filter.limit.is_none_or(|limit| messages < limit);
+    // With those that were silent.
+    let seen: BTreeSet<String> = recording.channels().map(|channel| channel.topic.clone()).collect();
     let absent = |topic: &&String| !seen.iter().any(|there| matches(std::slice::from_ref(*topic), there));
     if let Some(topic) = filter.topics.iter().filter(|_| whole).find(absent) {
         let there = if seen.is_empty() { "none".to_owned() } else { Vec::from_iter(seen).join(", ") };

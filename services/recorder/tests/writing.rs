@@ -372,6 +372,21 @@ fn a_moment_has_no_rate() {
 }
 
 #[test]
+fn a_silent_topic_is_there_and_an_unknown_one_is_told() {
+    let dir = TempDir::new("silent");
+    let mut rig = Rig::start(stack(dir.path()), Config::default());
+    rig.send(&[frame(1, clock::mono_ns())]);
+    let file = rig.stop().remove(0);
+    let print = |topic: &str| {
+        let filter = Filter { topics: vec![topic.into()], ..Filter::default() };
+        cat(&file, &filter, Format::Json, &mut std::io::sink()).map(|p| p.messages).map_err(|e| e.to_string())
+    };
+    assert_eq!((print("can0/rx"), print("plc/scan")), (Ok(1), Ok(0)));
+    let said = print("can9/*").unwrap_err();
+    assert!(said.contains("no topic 'can9/*'; there are: ") && said.contains("plc/scan"), "{said}");
+}
+
+#[test]
 fn a_file_that_is_deleted_while_it_is_written_is_told_and_another_begins() {
     let dir = TempDir::new("deleted");
     let mut rig = Rig::start(stack(dir.path()), Config::default());

@@ -210,7 +210,7 @@ impl Names {
             let near = nearest(wanted, lasts.iter().map(String::as_str))?;
             names.iter().copied().find(|n| last(n) == near)
         });
-        let near = near.map(|n| format!("; did you mean '{n}'? ")).unwrap_or_else(|| "; ".to_owned());
+        let near = near.map_or_else(|| "; ".to_owned(), |n| format!("; did you mean '{n}'? "));
         let list =
             if names.is_empty() { "there are only %-addresses" } else { "`dinrail plc list` shows all" };
         format!("no variable '{asked}'{near}{list}")
@@ -298,7 +298,7 @@ fn owners<'a>(map: &'a DebugMap, asked: &str) -> Vec<&'a str> {
         }
     }
     let parts = |path: &&str| path.matches('.').count();
-    let fewest = found.iter().map(|p| parts(p)).min().unwrap_or(0);
+    let fewest = found.iter().map(&parts).min().unwrap_or(0);
     found.retain(|path| parts(path) == fewest);
     found
 }
@@ -479,7 +479,7 @@ mod tests {
         let entries = names.entries();
         let of = |var: &str| entries.iter().find(|e| e.var == var).unwrap();
         assert_eq!(of("Main.mode").values, ["Off", "Auto"]);
-        assert_eq!(of("Main.kept").retain, true);
+        assert!(of("Main.kept").retain);
         assert_eq!(of("Level").declared, "service 'io' in[0]");
         assert_eq!(of("Level").address.as_deref(), Some("%ID1"));
         assert_eq!(of("Main.n").declared, "main.st:3");

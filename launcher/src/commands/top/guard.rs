@@ -73,6 +73,13 @@ fn give_up() -> ! {
     std::process::exit(1)
 }
 
+/// Whether the terminal is gone.
+pub fn is_gone() -> bool {
+    let keys = std::io::stdin();
+    let mut fds = [PollFd::new(&keys, PollFlags::empty())];
+    poll(&mut fds, Some(&Timespec { tv_sec: 0, tv_nsec: 0 })).is_ok() && fds[0].revents().intersects(GONE)
+}
+
 /// Waits until a key can be read, at most `limit`; false when the terminal is gone.
 pub fn wait_for_keys(limit: Duration) -> bool {
     let keys = std::io::stdin();

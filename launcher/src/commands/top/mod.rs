@@ -57,7 +57,7 @@ pub fn run(stack: Option<&str>, every: Duration) -> anyhow::Result<()> {
     let _ = screen.terminal.show_cursor();
     let restored = ratatui::try_restore().context("restoring the terminal");
     // What fails on a terminal that is gone is nobody's error.
-    if guard.asked() { Ok(()) } else { ended.and(restored) }
+    if guard.asked() || guard::is_gone() { Ok(()) } else { ended.and(restored) }
 }
 
 struct Screen {

@@ -328,6 +328,8 @@ impl Network {
 
     fn booted(&mut self, now_ns: u64, i: usize, kept: bool) {
         let id = self.nodes[i].id();
+        // Of the safe state before this boot-up: whether it is to run is decided anew.
+        self.nodes[i].held = false;
         if kept {
             self.nodes[i].wanted = OPERATIONAL;
         }

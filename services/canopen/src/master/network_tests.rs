@@ -433,6 +433,29 @@ fn what_boots_in_the_safe_state_is_held_and_started_at_its_end() {
 }
 
 #[test]
+fn a_node_that_is_not_started_after_a_boot_up_is_not_started_by_the_end_of_the_safe_state() {
+    let mut config = config(json!([node(2)]));
+    config["start_nodes"] = false.into();
+    let mut bus = Bus::new(config, &[2], false);
+    bus.start();
+    bus.run(200);
+    // A user started it; in the safe state it begins again.
+    let mut out = Outbox::default();
+    bus.network.nmt(bus.now, NmtCommand::Start, 2, &mut out);
+    bus.pass(0, out);
+    bus.run(100);
+    assert!(bus.network.nodes()[0].is_operational());
+    set_safe(&mut bus, Some(NmtCommand::EnterPreOperational));
+    bus.send(2, CanFrame::classic(0x702, &[0]));
+    bus.run(300);
+    assert!(bus.network.nodes()[0].boot.is_running());
+    bus.log.clear();
+    set_safe(&mut bus, None);
+    bus.run(200);
+    assert_eq!(commands(&mut bus), []);
+}
+
+#[test]
 fn nodes_that_start_together_exchange_also_without_error_control() {
     let mut one = node(2);
     one.as_object_mut().unwrap().remove("heartbeat");

@@ -2,6 +2,7 @@
 
 mod book;
 mod jobs;
+mod later;
 mod report;
 mod setup;
 
@@ -24,10 +25,11 @@ use ipc_types::event::Budget;
 use ipc_types::inputs::InputsPort;
 use ipc_types::outputs::{Change, Guard, Words, gather};
 use ipc_types::payload::{CanFrame, HealthState, Inputs};
-use ipc_types::turns::{Turn, Turns};
+use ipc_types::turns::Turns;
 use ipc_types::wiring::ImageRange;
 use ipc_types::{Context, clock};
 use jobs::Desk;
+use later::Later;
 use setup::safe_values;
 
 /// Runs until the launcher says stop.
@@ -75,7 +77,7 @@ pub fn run(mut ctx: Context) -> Result<(), RunError> {
         events: Budget::new(EVENTS_A_SECOND),
         sync_late_ns: (0, 0),
         sync_out_ns: (0, 0),
-        regular: Turn::default(),
+        later: Later::default(),
     };
     service.introduce();
     if !service.await_driver(&mut turns)? {
@@ -103,7 +105,7 @@ struct Service {
     /// From the SYNC to its last PDO in the driver's queue, likewise.
     sync_out_ns: (u64, u64),
     /// What is due with the heartbeat and waits for the SYNC.
-    regular: Turn,
+    later: Later,
 }
 
 impl Station for Service {
@@ -148,13 +150,9 @@ impl Service {
             self.on_time();
             self.answer_jobs();
             self.tell_events();
-            self.regular.beat |= due.beat;
-            self.regular.status |= due.status;
             // A status takes longer than a SYNC may be late. The turn of the SYNC does it.
-            if !self.network.is_sync_near(now_ns) {
-                let regular = std::mem::take(&mut self.regular);
-                Station::regular(self, regular);
-            }
+            let regular = self.later.take(due, self.network.is_sync_near(now_ns), now_ns);
+            self.regular(regular);
             let next_ns = self.ports.next_ns(now_ns, more, self.network.next_deadline());
             turns.come_again(next_ns)?;
         }

@@ -195,21 +195,17 @@ impl Tables {
             (Type::Array(a), _) => self.write_array(image, at, a, init),
             (Type::Struct(i), _) => {
                 let Some(s) = self.structs.get(*i as usize) else { return };
-                let given = members(init);
-                for (n, f) in s.fields.iter().enumerate() {
-                    let own = given.iter().rev().find(|(i, _)| *i as usize == n).map_or(&f.init, |(_, d)| d);
-                    self.write_init(image, at + f.offset as usize, &f.ty, own);
+                for (f, given) in s.fields.iter().zip(members(init, s.fields.len())) {
+                    self.write_init(image, at + f.offset as usize, &f.ty, given.unwrap_or(&f.init));
                 }
             }
             (Type::Fb(i), _) => {
                 let Some(p) = self.pous.get(*i as usize) else { return };
-                let given = members(init);
-                for (n, v) in p.vars.iter().enumerate() {
+                for (v, given) in p.vars.iter().zip(members(init, p.vars.len())) {
                     if !v.has_storage() || v.section == Section::InOut {
                         continue;
                     }
-                    let own = given.iter().rev().find(|(i, _)| *i as usize == n).map_or(&v.init, |(_, d)| d);
-                    self.write_init(image, at + v.offset as usize, &v.ty, own);
+                    self.write_init(image, at + v.offset as usize, &v.ty, given.unwrap_or(&v.init));
                 }
             }
             (_, InitData::Scalar(c)) => {
@@ -255,11 +251,18 @@ impl Tables {
     }
 }
 
-fn members(init: &InitData) -> &[(u32, InitData)] {
-    match init {
-        InitData::Members(m) => m,
-        _ => &[],
+/// What is given for each of so many members; of two the later one. By place: to search for each member would take long
+/// where an array has many elements of many members.
+fn members(init: &InitData, count: usize) -> Vec<Option<&InitData>> {
+    let mut given = vec![None; count];
+    if let InitData::Members(list) = init {
+        for (member, data) in list.iter() {
+            if let Some(place) = given.get_mut(*member as usize) {
+                *place = Some(data);
+            }
+        }
     }
+    given
 }
 
 /// Little-endian bytes of a constant.

@@ -51,7 +51,10 @@ impl Writer {
         if self.open.is_none() {
             return;
         }
-        if let Err(error) = self.write_gaps(true) {
+        // A last chunk that does not fit is a disk that failed: what was in memory only is counted as lost.
+        let close = |open: &mut Open| open.mcap.close_chunk();
+        let closed = self.write_gaps(true).and_then(|()| self.open.as_mut().map_or(Ok(()), close));
+        if let Err(error) = closed {
             return self.fail(&error);
         }
         let Some(open) = self.open.take() else { return };
@@ -257,10 +260,12 @@ impl Writer {
             self.rotate();
         }
     }
+
     /// A file that somebody deleted, or whose folder, takes what is written to it along when it is closed.
     fn replace_deleted(&mut self) {
         use std::os::unix::fs::MetadataExt;
-        let deleted = |open: &Open| open.file.metadata().is_ok_and(|m| m.nlink() == 0);
+        // Some file systems count no links: there the name decides.
+        let deleted = |open: &Open| open.file.metadata().is_ok_and(|m| m.nlink() == 0) && !open.path.exists();
         let Some(open) = self.open.take_if(|open| deleted(open)) else { return };
         self.sync(Command::Gone(open.path.clone()));
         self.shelf.forget(&open.path);

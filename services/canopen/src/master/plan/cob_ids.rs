@@ -79,10 +79,15 @@ impl One<'_> {
         }
     }
 
-    /// The SYNC that a node listens to, where it is not the master's.
+    /// The SYNC's COB-ID, where a node does not listen to it by itself. An EDS that leaves it open says 0, which no SYNC
+    /// can have: then it is the usual one.
     pub(super) fn sync_cob_id_default(&self, default: u32) -> Option<u32> {
         let wanted = u32::from(self.config.sync_cob_id);
-        (CobId(default).can_id() != wanted).then_some(wanted)
+        let own = match CobId(default).can_id() {
+            0 => predefined::SYNC,
+            id => id,
+        };
+        (own != wanted).then_some(wanted)
     }
 
     /// Two PDOs of the network with one COB-ID, or one with the SYNC's.

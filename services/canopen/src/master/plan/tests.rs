@@ -1,6 +1,8 @@
 use super::*;
 use crate::master::boot::Write;
 use crate::master::testing::device;
+use crate::protocol::data_type::DataType;
+use crate::protocol::od::{Access, EntryDef, OdBuilder};
 use serde_json::json;
 
 fn planned(table: serde_json::Value) -> Plan {
@@ -201,4 +203,24 @@ fn nodes_are_told_of_another_sync() {
     assert_eq!(writes(with(0x300, json!([]))), Some(vec![0, 3, 0, 0]));
     let by_hand = json!([{ "object": "1005", "value": 0x301 }]);
     assert_eq!(writes(with(0x300, by_hand)), Some(vec![1, 3, 0, 0]), "once, and as the stack file says");
+    // An EDS without a default.
+    let of_open = |access: Access, table: serde_json::Value| {
+        let config: Config = serde_json::from_value(table).unwrap();
+        let mut device = device(5);
+        let mut b = OdBuilder::new();
+        b.var(0x1000, EntryDef::new(DataType::Unsigned32, Access::Ro));
+        b.var(0x1005, EntryDef::new(DataType::Unsigned32, access));
+        device.od = b.build(5).unwrap();
+        let plan = plan(&config, &BTreeMap::from([(5, device)]), Addressing::Element, "io");
+        let written = plan.nodes[0].settings.plan.writes.iter().any(|w| w.index == 0x1005);
+        (written, plan.mistakes.iter().any(|m| m.message.contains("does not hear")))
+    };
+    for (access, id, told) in [
+        (Access::Rw, 0x80, (false, false)),
+        (Access::Ro, 0x80, (false, false)),
+        (Access::Rw, 0x300, (true, false)),
+        (Access::Ro, 0x300, (false, true)),
+    ] {
+        assert_eq!(of_open(access, with(id, json!([]))), told, "{id:X}");
+    }
 }

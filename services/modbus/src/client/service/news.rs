@@ -47,11 +47,13 @@ impl Service {
                 let words = exception_words(code, function);
                 let check = match code {
                     1 => "does the unit have this table, or the other one of its kind?".to_owned(),
+                    2 if count == 1 => format!("`at` counts from 0 ({number} is at = {at})"),
                     2 => {
                         format!("`at` counts from 0 ({number} is at = {at}); does the unit have all {count}?")
                     }
-                    3 => format!("does the unit allow {count} in one request, and this value?"),
-                    _ => "see the manual of the unit".to_owned(),
+                    3 if count == 1 => "may this one stand in a request alone, with this value?".to_owned(),
+                    3 => format!("does the unit take {count} in one request?"),
+                    _ => "the manual of the unit".to_owned(),
                 };
                 let message = format!("{name}: {what} cannot be {done}: {words}; check: {check}");
                 self.tell(EventKind::BusState, Level::Warning, message);
