@@ -279,13 +279,15 @@ mod tests {
 
     #[test]
     fn an_event_that_is_too_long_loses_its_detail_then_the_end_of_its_message() {
-        let body = |message: String, detail| EventBody::now(EventKind::Loaded, Level::Info, "plc", message, detail);
+        let body =
+            |message: String, detail| EventBody::now(EventKind::Loaded, Level::Info, "plc", message, detail);
         let told = |mut body: EventBody| {
             let text = fit(&mut body, 2048);
             assert!(!text.is_empty() && text.len() <= 2048, "{}", text.len());
             serde_json::from_slice::<EventBody>(&text).map_err(|e| e.to_string())
         };
-        let short = told(body("loaded".into(), serde_json::json!({ "hash": 7 }))).map(|b| (b.message, b.detail));
+        let short =
+            told(body("loaded".into(), serde_json::json!({ "hash": 7 }))).map(|b| (b.message, b.detail));
         assert_eq!(short, Ok(("loaded".into(), serde_json::json!({ "hash": 7 }))));
         let long = told(body("loaded".into(), serde_json::json!("x".repeat(4000)))).map(|b| b.message);
         assert_eq!(long, Ok("loaded".into()));

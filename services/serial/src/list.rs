@@ -147,7 +147,7 @@ fn has_other_end(pid: u32, number: u32) -> bool {
         .any(|d| fs::read_to_string(d.path()).is_ok_and(|info| tty_index(&info) == Some(number)))
 }
 
-/// `tty-index:	3` of an `fdinfo`.
+/// The number behind `tty-index:` of an `fdinfo`.
 fn tty_index(info: &str) -> Option<u32> {
     info.lines().find_map(|line| line.strip_prefix("tty-index:")?.trim().parse().ok())
 }

@@ -477,8 +477,8 @@ fn a_node_that_does_not_come_back_from_a_reset_is_lost() {
     let mut out = Outbox::default();
     bus.network.nmt(bus.now, NmtCommand::ResetNode, 2, &mut out);
     bus.pass(0, out);
-    bus.run(900);
-    assert_eq!(bus.said(), "", "a second for its boot-up message");
+    bus.run(9_900);
+    assert_eq!(bus.said(), "", "ten seconds for its boot-up message: drives need some");
     bus.run(200);
     assert_eq!(bus.said(), "Lost { node: 2, guarding: false }\n");
 }

@@ -215,11 +215,16 @@ impl Parser<'_> {
         match (before, self.kind()) {
             (Some(TokenKind::Eq), TokenKind::Eq) if adjacent => Some("\"equal\" is written `=`"),
             (Some(TokenKind::Amp), TokenKind::Amp) if adjacent => Some("\"and\" is written AND or `&`"),
-            (_, TokenKind::Eq) if !matches!(before, Some(TokenKind::Assign)) => Some("an assignment is written `:=`"),
+            (_, TokenKind::Eq) if !matches!(before, Some(TokenKind::Assign)) => {
+                Some("an assignment is written `:=`")
+            }
             (Some(TokenKind::Word(None)), _) => {
                 let last = self.last_span();
                 let word = self.text.get(last.start as usize..last.end as usize).unwrap_or("");
-                ["ELSEIF", "ELIF"].iter().any(|w| word.eq_ignore_ascii_case(w)).then_some("it is written ELSIF")
+                ["ELSEIF", "ELIF"]
+                    .iter()
+                    .any(|w| word.eq_ignore_ascii_case(w))
+                    .then_some("it is written ELSIF")
             }
             _ => None,
         }

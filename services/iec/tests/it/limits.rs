@@ -182,7 +182,8 @@ fn programs_made_to_hurt() {
         assert_eq!(errors(&text), ["E0805"]);
         told("memory");
         // Initial values of many members, in each of many elements.
-        let members = |what: &str, by: &str| (0..4000).map(|i| format!("m{i}{what}")).collect::<Vec<_>>().join(by);
+        let members =
+            |what: &str, by: &str| (0..4000).map(|i| format!("m{i}{what}")).collect::<Vec<_>>().join(by);
         let text = format!(
             "TYPE s : STRUCT {} : BYTE; END_STRUCT; t : s := ({}); END_TYPE
             FUNCTION f : INT VAR a : ARRAY [0..1499] OF t; END_VAR f := BYTE_TO_INT(a[1499].m3999); END_FUNCTION

@@ -1,7 +1,7 @@
 //! NMT commands: queued, sent in order with the inhibit time between them.
 
 use super::Network;
-use crate::master::boot::{BOOT_UP_NS, ErrorControl, OPERATIONAL};
+use crate::master::boot::{ErrorControl, OPERATIONAL};
 use crate::protocol::io::Outbox;
 use crate::protocol::nmt::{NmtCommand, NmtState};
 
@@ -23,6 +23,9 @@ pub fn state_name(state: u8) -> &'static str {
     NmtState::from_wire(state).map_or("unknown", NmtState::name)
 }
 
+/// A node that a user resets may be silent so long before it counts as lost: drives take seconds to begin again.
+const RESET_NS: u64 = 10_000_000_000;
+
 impl Network {
     /// Queues an NMT command; node 0 is all.
     pub(super) fn command(&mut self, command: NmtCommand, node: u8) {
@@ -43,7 +46,7 @@ impl Network {
                     let node = &mut self.nodes[i];
                     // It is silent while it begins again; one that stays silent is lost.
                     if let Some(watch) = &mut node.watch {
-                        watch.renew(now_ns, BOOT_UP_NS);
+                        watch.renew(now_ns, RESET_NS);
                     }
                     node.state = None;
                 }
