@@ -171,10 +171,13 @@ fn check_retain_file(config: &Config, stack: &Stack, me: &str, findings: &mut Ve
     let Some(file) = &config.retain_file else { return };
     let path = stack.dir.join(file);
     let folder = path.parent().filter(|f| !f.as_os_str().is_empty());
-    if path.is_dir() || folder.is_some_and(|f| !f.is_dir()) {
-        let what = if path.is_dir() { "is a folder" } else { "lies in a folder that does not exist" };
-        let message = format!("{} {what}", path.display());
+    if path.is_dir() {
+        let message = format!("{} is a folder", path.display());
         findings.push(Finding::error(me, "retain_file", message, "name a file in a folder that exists"));
+    } else if let Some(folder) = folder.filter(|f| !f.is_dir()) {
+        // No error: a disk that is mounted late must not keep the plant down.
+        let message = format!("the folder {} of the retain file does not exist", folder.display());
+        findings.push(Finding::warning(me, "retain_file", message, "make it, or mount its disk: until then nothing is kept"));
     }
     // Each would overwrite what the other keeps.
     let other = stack.services.iter().filter(|s| s.kind == KIND && s.name != me).find(|s| {

@@ -135,18 +135,18 @@ pub fn write(
     Ok(())
 }
 
-/// `40001: 1 value written as float ABCD, 2 registers`.
+/// `40001: 1 value written as float ABCD, 2 registers`: text and bits say less.
 fn written(point: &Point, entries: usize) -> String {
     let number = point.number(0);
-    let (values, entry) = (point.count, if point.table.is_bits() { "coil" } else { "register" });
+    let values = point.count;
     if point.value_type == ValueType::Text {
-        return format!("{number}: text written, {entries} {entry}{}", plural(entries));
+        return format!("{number}: text written, {entries} register{}", plural(entries));
     }
     let value = format!("{values} value{} written", plural(values.into()));
-    match point.table.is_bits() {
-        true => format!("{number}: {value}"),
-        false => format!("{number}: {value} as {}, {entries} {entry}{}", point.form(), plural(entries)),
+    if point.table.is_bits() {
+        return format!("{number}: {value}");
     }
+    format!("{number}: {value} as {}, {entries} register{}", point.form(), plural(entries))
 }
 
 fn plural(count: usize) -> &'static str {
