@@ -91,8 +91,21 @@ pub fn set(
                 eprintln!("dinrail: {}", fleeting(var, owner));
             }
         }
+        for var in held(line, &list) {
+            eprintln!(
+                "dinrail: '{var}' is forced and keeps its value; `dinrail plc unforce {var}` lets go of it"
+            );
+        }
     }
     Ok(())
+}
+
+/// Which of these are forced: what is written to them takes no effect.
+fn held(line: &mut JobLine, list: &[Assignment]) -> Vec<String> {
+    let Ok(answer) = line.ask(&json!({ "do": "status" }), LIMIT) else { return Vec::new() };
+    let forces = answer.get("forces").and_then(Value::as_array).cloned().unwrap_or_default();
+    let forced = |var: &str| forces.iter().any(|f| f.as_str().is_some_and(|f| f.eq_ignore_ascii_case(var)));
+    list.iter().map(|(var, _)| var.clone()).filter(|var| forced(var)).collect()
 }
 
 fn fleeting(var: &str, owner: &str) -> String {

@@ -163,6 +163,9 @@ pub(super) fn stack_text(s: &StackStatus) -> String {
             "\nheld, not started again: {names}; `dinrail logs SERVICE` says why, `dinrail restart SERVICE` starts it"
         );
     }
+    if !s.degraded.is_empty() {
+        text += &format!("\ndegraded: {}; below each says why", s.degraded.join(", "));
+    }
     if !s.unstable.is_empty() {
         let names = s.unstable.join(", ");
         text += &format!(

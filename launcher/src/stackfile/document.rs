@@ -68,7 +68,9 @@ pub fn read(text: &str, kinds: &'static [Kind], sink: &mut Sink<'_>) -> Option<D
             let mut lines = error.message().lines().map(str::trim).filter(|l| !l.is_empty());
             let first = lines.next().unwrap_or("the text cannot be read");
             let rest: Vec<&str> = lines.collect();
-            let help = if rest.is_empty() {
+            let help = if sink.source.file.extension().is_some_and(|e| e != "toml") {
+                "a stack file is asked for (stack.toml), or its folder; it names the program".to_owned()
+            } else if rest.is_empty() {
                 "stack files are TOML: https://toml.io".to_owned()
             } else {
                 rest.join("\n")
@@ -114,22 +116,61 @@ fn common_slip(text: &str, span: &Range<usize>) -> Option<(Range<usize>, String,
     let at = text.floor_char_boundary(span.start.min(text.len()));
     let start = text[..at].rfind('\n').map_or(0, |i| i + 1);
     let line = text[start..].lines().next().unwrap_or_default();
-    let (key, value) = line.split_once('=')?;
+    bare_value(line, start)
+}
+
+/// A value that lacks its quotes, has others, or is written as in another language; `start`: where the line begins.
+fn bare_value(line: &str, start: usize) -> Option<(Range<usize>, String, String)> {
     let plain = |c: char| c.is_alphanumeric() || matches!(c, '_' | '-' | '.' | ':' | '/' | '%');
-    let word = value.split('#').next().unwrap_or_default().trim();
-    let bare =
-        word.starts_with(|c: char| c.is_alphabetic() || matches!(c, '/' | '%')) && word.chars().all(plain);
-    let key = key.trim();
-    if !bare || key.is_empty() || !key.chars().all(plain) || ["true", "false", "inf", "nan"].contains(&word) {
+    let Some((key, value)) = line.split_once('=') else {
+        let (key, value) = line.split_once(':')?;
+        let named = !key.trim().is_empty() && key.trim().chars().all(plain) && !value.trim().is_empty();
+        let (key, value) = (key.trim(), value.trim());
+        let colon = start + line.find(':')?;
+        return named.then(|| {
+            (colon..colon + 1, format!("':' behind '{key}'"), format!("TOML writes {key} = {value}"))
+        });
+    };
+    let (key, word) = (key.trim(), value.split('#').next().unwrap_or_default().trim());
+    if key.is_empty() || !key.chars().all(plain) || word.is_empty() {
         return None;
     }
-    let from = start + line.find(word)?.max(line.find('=')?);
-    let from = from + text[from..].find(word)?;
-    Some((
-        from..from + word.len(),
-        format!("the value of '{key}' is a text without quotes"),
-        format!("write {key} = \"{word}\""),
-    ))
+    let from = start + line.find('=')? + 1 + value.find(word)?;
+    let at = from..from + word.len();
+    if let Some(inner) = word.strip_prefix(['“', '”', '„', '‘', '’', '«', '»']) {
+        let inner = inner.trim_end_matches(['“', '”', '‘', '’', '«', '»']);
+        return Some((
+            at,
+            format!("the quotes of '{key}' are typographic ones"),
+            format!("write {key} = \"{inner}\" with plain quotes"),
+        ));
+    }
+    if !word.chars().all(plain) || ["true", "false", "inf", "nan"].contains(&word) {
+        return None;
+    }
+    if word.eq_ignore_ascii_case("true") || word.eq_ignore_ascii_case("false") {
+        let lower = word.to_lowercase();
+        return Some((at, format!("'{word}' is written in small letters"), format!("write {key} = {lower}")));
+    }
+    let digits = word.starts_with(|c: char| c.is_ascii_digit());
+    if digits
+        && word.chars().all(|c| c.is_ascii_hexdigit())
+        && word.contains(|c: char| c.is_ascii_alphabetic())
+    {
+        return Some((
+            at,
+            format!("the value of '{key}' is no number"),
+            format!("hexadecimal numbers begin with 0x: write {key} = 0x{word}"),
+        ));
+    }
+    let text = if digits {
+        word.ends_with(|c: char| c.is_ascii_alphabetic())
+    } else {
+        !word.starts_with(['-', '.', ':'])
+    };
+    text.then(|| {
+        (at, format!("the value of '{key}' is a text without quotes"), format!("write {key} = \"{word}\""))
+    })
 }
 
 const ONE_BRACKET: &str = "write [[service]] with two brackets for each service";

@@ -80,6 +80,9 @@ pub struct StackStatus {
     /// Services that die again and again, too seldom to be held for it.
     #[serde(default)]
     pub unstable: Vec<String>,
+    /// Services at work that say of themselves that something is not as it should be.
+    #[serde(default)]
+    pub degraded: Vec<String>,
     pub failed: Option<String>,
 }
 

@@ -379,7 +379,8 @@ impl Supervisor {
                 none if none.is_empty() => none,
                 some => format!("; degraded: {some} (`dinrail status` says why)"),
             };
-            self.console.out(format!("all {count} services ready after {after_ms} ms{degraded}"));
+            let services = if count == 1 { "the service is" } else { &format!("all {count} services") };
+            self.console.out(format!("{services} ready after {after_ms} ms{degraded}"));
             if let Some(tour) = self.options.tour.take() {
                 self.console.out(tour);
             }
@@ -452,7 +453,7 @@ impl Supervisor {
     }
 
     /// Services that work, but say that something is not as it should be.
-    fn degraded(&self) -> Vec<String> {
+    pub(super) fn degraded(&self) -> Vec<String> {
         let named = self.services.iter().zip(&self.stack.services);
         named.filter(|(service, _)| service.degraded).map(|(_, entry)| entry.name.clone()).collect()
     }

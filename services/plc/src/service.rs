@@ -177,7 +177,12 @@ fn check_retain_file(config: &Config, stack: &Stack, me: &str, findings: &mut Ve
     } else if let Some(folder) = folder.filter(|f| !f.is_dir()) {
         // No error: a disk that is mounted late must not keep the plant down.
         let message = format!("the folder {} of the retain file does not exist", folder.display());
-        findings.push(Finding::warning(me, "retain_file", message, "make it, or mount its disk: until then nothing is kept"));
+        findings.push(Finding::warning(
+            me,
+            "retain_file",
+            message,
+            "make it, or mount its disk: until then nothing is kept",
+        ));
     }
     // Each would overwrite what the other keeps.
     let other = stack.services.iter().filter(|s| s.kind == KIND && s.name != me).find(|s| {

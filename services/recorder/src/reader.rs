@@ -35,7 +35,7 @@ pub const MAX_DAMAGES: usize = 16;
 /// Why a file cannot be read at all.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadError {
-    #[error("cannot open {path}: {source}")]
+    #[error("cannot open {path}: {source}; recordings lie in the `dir` of the stack's recorder")]
     Open { path: PathBuf, source: io::Error },
     #[error("{path} is no MCAP file: it does not begin with MCAP's magic bytes")]
     NotMcap { path: PathBuf },

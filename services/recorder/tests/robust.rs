@@ -353,7 +353,7 @@ fn what_is_no_recording_is_refused_with_path_and_remedy() {
     assert!(error.to_string().contains("notes.txt is no MCAP file"), "{error}");
     let missing = dir.path().join("missing.mcap");
     let error = Recording::open(&missing).err().unwrap().to_string();
-    assert!(error.contains("missing.mcap") && error.contains("dinrail recordings"), "{error}");
+    assert!(error.contains("missing.mcap") && error.contains("the stack's recorder"), "{error}");
     assert!(Recording::open(dir.path()).err().unwrap().to_string().contains("is a folder"));
     // lz4 is named with its remedy, and what stands outside of chunks is still read.
     let mut bytes = mcap::MAGIC.to_vec();

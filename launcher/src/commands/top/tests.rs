@@ -113,6 +113,7 @@ pub fn snapshot(second: u64) -> Snapshot {
             ready: 4,
             held: vec![],
             unstable: vec![],
+            degraded: vec![],
             failed: None,
         }),
         rows,

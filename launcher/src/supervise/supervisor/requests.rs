@@ -172,6 +172,7 @@ impl Supervisor {
             ready: ready as u32,
             held,
             unstable,
+            degraded: self.degraded(),
             failed: self.policy.failed().map(str::to_owned),
         }
     }

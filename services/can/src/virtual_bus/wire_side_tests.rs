@@ -168,7 +168,8 @@ fn flood(
         let taken = bus.take(client, rest, now_ns, &mut seen);
         rest = &rest[taken.used..];
         if taken.stopped != Some(Stopped::Turn) {
-            return (count - rest.iter().filter(|b| **b == b'\r').count(), taken.stopped);
+            let left = rest.split_inclusive(|b| *b == b'\r').count();
+            return (count - left, taken.stopped);
         }
     }
 }
