@@ -201,17 +201,7 @@ pub fn human(bytes: u64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::TempDir;
-
-    fn file(dir: &Path, name: &str, bytes: usize, finished: bool) -> PathBuf {
-        let path = dir.join(name);
-        let mut data = vec![0u8; bytes];
-        if finished {
-            data[bytes - 8..].copy_from_slice(mcap::MAGIC);
-        }
-        std::fs::write(&path, data).unwrap();
-        path
-    }
+    use crate::testing::{TempDir, file};
 
     #[test]
     fn only_names_of_this_stack_count() {

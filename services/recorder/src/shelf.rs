@@ -121,18 +121,8 @@ fn delete(path: &Path) -> bool {
 mod tests {
     use super::*;
     use crate::disk::{all_recordings, file_name, lock};
-    use crate::testing::TempDir;
+    use crate::testing::{TempDir, file};
     use std::fs::File;
-
-    fn file(dir: &Path, name: &str, bytes: usize, finished: bool) -> PathBuf {
-        let path = dir.join(name);
-        let mut data = vec![0u8; bytes];
-        if finished {
-            data[bytes - 8..].copy_from_slice(mcap::MAGIC);
-        }
-        std::fs::write(&path, data).unwrap();
-        path
-    }
 
     fn shelf(dir: &Path) -> Shelf {
         let mut shelf = Shelf::new(dir, "s");

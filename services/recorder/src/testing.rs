@@ -75,3 +75,14 @@ pub fn stack_of(name: &str, dir: &Path, topics: &[(&str, TopicKind)]) -> Stack {
         topics,
     }
 }
+
+/// A file of so many bytes that ends as a finished recording does, or not.
+pub fn file(dir: &Path, name: &str, bytes: usize, finished: bool) -> PathBuf {
+    let path = dir.join(name);
+    let mut data = vec![0u8; bytes];
+    if finished {
+        data[bytes - 8..].copy_from_slice(mcap::MAGIC);
+    }
+    std::fs::write(&path, data).unwrap();
+    path
+}
